@@ -4,6 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= runs/demo
 
+# Compiled modules are kept, also where a container's image switches that off: tests start some hundred processes.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo check test test-random suite quick lint rules types clean
 
 TEST := $(BIN)/python -m pytest

@@ -1,4 +1,4 @@
-"""Folders of the shipped data, the same from a wheel, an editable install and a plain checkout."""
+"""Folders of the shipped data in a wheel, an editable install or a checkout."""
 
 from __future__ import annotations
 

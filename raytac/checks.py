@@ -1,4 +1,7 @@
-"""Checks of arguments: each returns the value in its own type, or raises ``InputError`` with the argument's name, value and rule."""
+"""Checks of arguments.
+
+Each returns the value in its own type, or raises ``InputError`` with the argument's name, value and rule.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,10 @@ MOST_ENVIRONMENTS = 2**24
 
 @dataclass(frozen=True)
 class Interval:
-    """A range of numbers, written as in mathematics: ``[0, 1)``. A closed infinite end admits ``inf`` itself."""
+    """A range of numbers, written as in mathematics: ``[0, 1)``.
+
+    A closed infinite end admits ``inf`` itself.
+    """
 
     low: float
     high: float

@@ -1,4 +1,4 @@
-"""Devices: choose CPU or CUDA once, and find the LLVM library that Dr.Jit compiles CPU code with.
+"""Devices: choose CPU or CUDA, and find the LLVM library of Dr.Jit's CPU code.
 
 Nothing here imports Mitsuba, Dr.Jit or Warp, so that asking is cheap and safe.
 """
@@ -62,7 +62,7 @@ def resolve_device(device: str = "auto", *, ray_tracing: bool = True) -> str:
 
 
 def cuda_missing(ray_tracing: bool = True) -> str:
-    """Reason why CUDA cannot work here, found without running anything on a device; empty if it should work."""
+    """Reason why CUDA cannot work here; empty if it should. Runs nothing on a device."""
     if cuda_device_count() == 0:
         return "no NVIDIA driver, or no CUDA device that this process may see"
     if not ray_tracing:
@@ -80,7 +80,10 @@ def cuda_missing(ray_tracing: bool = True) -> str:
 
 @functools.cache
 def cuda_device_count() -> int:
-    """Number of CUDA devices that the driver shows this process; 0 without a driver. Creates no CUDA context."""
+    """Number of CUDA devices that the driver shows this process; 0 without a driver.
+
+    Creates no CUDA context.
+    """
     driver = _load(("nvcuda.dll",) if sys.platform == "win32" else ("libcuda.so.1", "libcuda.so"))
     if driver is None or driver.cuInit(0) != 0:
         return 0
@@ -99,7 +102,10 @@ def cuda_driver_version() -> tuple[int, int]:
 
 @functools.cache
 def total_memory(device: str) -> int:
-    """Memory of the machine (``"cpu"``) or of the first CUDA device (``"cuda"``) [byte], whoever uses it. Creates no CUDA context."""
+    """Memory [byte] of the machine (``"cpu"``) or of the first CUDA device (``"cuda"``).
+
+    Whoever uses it. Creates no CUDA context.
+    """
     if device == "cpu":
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     driver, handle, size = _load(("nvcuda.dll", "libcuda.so.1", "libcuda.so")), ctypes.c_int(0), ctypes.c_size_t(0)
@@ -112,7 +118,10 @@ def total_memory(device: str) -> int:
 
 @functools.cache
 def optix_library() -> str | None:
-    """Name of the OptiX library that can be loaded (``DRJIT_LIBOPTIX_PATH`` wins, as in Dr.Jit), or None."""
+    """Name of the OptiX library that can be loaded, or None.
+
+    ``DRJIT_LIBOPTIX_PATH`` wins, as in Dr.Jit.
+    """
     name = os.environ.get("DRJIT_LIBOPTIX_PATH") or ("nvoptix.dll" if sys.platform == "win32" else "libnvoptix.so.1")
     return name if _load((name,)) is not None else None
 

@@ -1,4 +1,6 @@
-"""``raytac doctor``: try what the jobs need, each in a process of its own, and say what will be used and how to mend the rest.
+"""``raytac doctor``: try what the jobs need, and say what will be used and how to mend it.
+
+Each trial is a process of its own.
 
 A library that aborts (LLVM 15 does, inside Dr.Jit, on some machines) takes its process down before Python can say a word; here it
 takes down only its probe.
@@ -232,7 +234,7 @@ def diagnose(probes: Sequence[Probe] = PROBES, *, timeout: float = 180.0) -> Rep
 
 
 def run_probe(probe: Probe, *, timeout: float = 180.0) -> Check:
-    """Run one probe in a process of its own; an abort, a crash or a hang of it is a finding, not an error."""
+    """Run one probe in its own process; an abort, crash or hang is a result, not an error."""
     if reason := probe.skip():
         return Check(probe.name, False, probe.required, reason, probe.fix)
     package_parent = str(Path(__file__).resolve().parents[1])

@@ -1,4 +1,4 @@
-"""Errors that raytac raises on purpose: each names the bad value, the rule it breaks and the choices there are."""
+"""Errors that raytac raises on purpose, with the bad value, the rule and the choices."""
 
 from __future__ import annotations
 
@@ -33,7 +33,10 @@ _LONGEST_WORD = 100
 
 
 class RaytacError(Exception):
-    """Base of every error that raytac raises on purpose; a message is one bounded text, whatever value it is about."""
+    """Base of every error that raytac raises on purpose.
+
+    The message is one bounded text, whatever value it is about.
+    """
 
     def __str__(self) -> str:
         text = super().__str__()
@@ -48,7 +51,10 @@ class AssetError(RaytacError, FileNotFoundError):
 
 
 class BackendError(RaytacError, RuntimeError):
-    """A renderer, solver or device that the job needs is missing or does not work here; the message says how to mend it."""
+    """A renderer, solver or device that the job needs is missing or does not work here.
+
+    The message says how to mend it.
+    """
 
 
 class InputError(RaytacError, ValueError):
@@ -107,7 +113,10 @@ class SpecError(RaytacError, ValueError):
 
 
 class CalibrationError(SpecError):
-    """A calibration folder cannot be used: a file is missing, damaged, or holds something of the wrong kind, shape or range."""
+    """A calibration folder cannot be used.
+
+    A file is missing, damaged, or holds something of the wrong kind, shape or range.
+    """
 
 
 class MeshError(SpecError):
@@ -115,7 +124,9 @@ class MeshError(SpecError):
 
 
 def short_repr(value: object, limit: int = 80) -> str:
-    """``repr`` cut to ``limit`` characters, for any value; a path as plain text and whole up to ``_LONGEST_PATH`` characters.
+    """``repr`` cut to ``limit`` characters, for any value.
+
+    A path is plain text, and whole up to ``_LONGEST_PATH`` characters.
 
     Integers too long to be printed, deep and long containers, and objects whose ``repr`` fails are abbreviated.
     """
@@ -131,7 +142,10 @@ def short_repr(value: object, limit: int = 80) -> str:
 
 
 def _pieces(value: object, limit: int, levels: int) -> Iterator[str]:
-    """``repr`` of ``value`` piece by piece, so that a reader can stop; no piece needs more than ``levels`` nested calls."""
+    """``repr`` of ``value`` piece by piece, so that a reader can stop.
+
+    No piece needs more than ``levels`` nested calls.
+    """
     if isinstance(value, (list, tuple, dict)) and type(value).__repr__ in (list.__repr__, tuple.__repr__, dict.__repr__):
         first, last = {list: "[]", tuple: "()", dict: "{}"}[next(t for t in (list, tuple, dict) if isinstance(value, t))]
         yield first

@@ -1,4 +1,7 @@
-"""A check that ``import ipc`` means raytac's own solver: other packages of that name can be installed."""
+"""A check that ``import ipc`` means raytac's own solver.
+
+Other packages of that name can be installed.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from pathlib import Path
 
 
 def foreign_ipc() -> str | None:
-    """Return where ``import ipc`` would come from if that is not raytac's own ``ipc`` package; None if all is well.
+    """Return the place of a foreign ``ipc`` package that ``import ipc`` would take, or None.
 
     The other package is not run: its file is read as text.
     """

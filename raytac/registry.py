@@ -1,4 +1,4 @@
-"""Implementations of one axis of the library by name: physics, optical modes or marker models."""
+"""Implementations of one axis by name: physics, optical modes or marker models."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Config = TypeVar("Config")
 
 
 class Registry(Generic[Config]):
-    """Names of the implementations of one axis, each with the frozen dataclass that configures it.
+    """Names of the implementations of one axis, and the frozen dataclass of each.
 
     Names that come with raytac are given as ``module:Class``, which is imported when it is first asked for, so that listing the names
     loads no renderer and no solver. :meth:`register` adds a name, and with it the implementation works wherever a name is accepted.

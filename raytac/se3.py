@@ -1,4 +1,7 @@
-"""Rotations and rigid transforms: matrices, quaternions, rotation vectors, wrenches, and checks of poses that users give."""
+"""Rotations and rigid transforms: matrices, quaternions, rotation vectors, wrenches.
+
+Poses that users give are checked here.
+"""
 
 from __future__ import annotations
 
@@ -150,7 +153,7 @@ def batch_of(world_from_pad: ArrayLike, axes: int, bodies: Mapping[str, ArrayLik
 
 
 def check_pose(name: str, value: ArrayLike) -> np.ndarray:
-    """``value`` as a float64 (4, 4) rigid transform. Raises ``InputError``, naming ``name``, if it is none."""
+    """``value`` as a float64 (4, 4) rigid transform; ``InputError`` with ``name`` otherwise."""
     matrix = check_numbers(name, value, (4, 4), finite=True)
     if np.abs(matrix[3] - (0.0, 0.0, 0.0, 1.0)).max() > _ORTHONORMAL:
         raise InputError(name, value=matrix[3].tolist(), rule="must have the last row 0, 0, 0, 1")

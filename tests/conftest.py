@@ -47,9 +47,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(mark)
 
 
-def pytest_runtest_setup() -> None:
+def pytest_runtest_setup(item: pytest.Item) -> None:
     one_thread.limit_renderer()
-    case_lights.share(make_sensor_spec())
+    place = item.path.relative_to(Path(__file__).parent).parts
+    case_lights.share(make_sensor_spec(), few=place[0] not in case_lights.MEASURED)
 
 
 def make_sensor_spec() -> SensorSpec:

@@ -49,6 +49,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "markers/test_other_models.py",
         "physics/rigid/test_pad_search.py",
         "physics/rigid/test_step_kernels.py",
+        "physics/rigid/test_warp_cache.py",
         "physics/test_soft.py",
         "physics/test_soft_batch.py",
         "physics/test_soft_forces.py",

@@ -24,6 +24,8 @@ _ROUNDING = 16 * 2.0**-53
 """Bound of the relative error of a determinant against the sum of its terms' sizes."""
 _UNDERFLOW = 1e-280
 """Terms below this may have lost digits to underflow."""
+_CHUNK = 64
+"""Boxes that are compared with others at once."""
 
 
 def _whole(x: Floats) -> NDArray[np.object_]:
@@ -114,18 +116,29 @@ def world_vertices(layout: Layout, y: Floats, rotation: Floats, position: Floats
     return np.einsum("vij,vj->vi", R[layout.vert_body], local) + position[layout.vert_body]
 
 
+def _reach(a_low: Floats, a_high: Floats, b_low: Floats, b_high: Floats) -> NDArray[np.bool_]:
+    """True where boxes overlap; shapes (..., 3) that fit each other."""
+    x, y, z = ((a_low[..., k] <= b_high[..., k]) & (a_high[..., k] >= b_low[..., k]) for k in range(3))
+    return x & y & z
+
+
 def _box_pairs(a_low: Floats, a_high: Floats, b_low: Floats, b_high: Floats) -> tuple[NDArray, NDArray]:
-    """Indices of overlapping boxes."""
-    reach_a = (a_low <= b_high.max(axis=0)).all(axis=1) & (a_high >= b_low.min(axis=0)).all(axis=1)
-    reach_b = (b_low <= a_high.max(axis=0)).all(axis=1) & (b_high >= a_low.min(axis=0)).all(axis=1)
-    ia, ib = np.flatnonzero(reach_a), np.flatnonzero(reach_b)
+    """Indices of overlapping boxes, ordered by the first and then by the second."""
+    ia = np.flatnonzero(_reach(a_low, a_high, b_low.min(axis=0), b_high.max(axis=0)))
+    ib = np.flatnonzero(_reach(b_low, b_high, a_low.min(axis=0), a_high.max(axis=0)))
     first, second = [np.zeros(0, int)], [np.zeros(0, int)]
-    for chunk in np.array_split(ia, max(1, len(ia) * len(ib) // 1_000_000)):
-        hit = (a_low[chunk, None] <= b_high[None, ib]).all(-1) & (a_high[chunk, None] >= b_low[None, ib]).all(-1)
-        i, j = np.nonzero(hit)
+    if len(ia):
+        ia = ia[np.argsort(a_low[ia, np.ptp(a_low[ia], axis=0).argmax()])]
+    # Boxes that follow each other lie in one slab, which few of the others reach.
+    for chunk in np.array_split(ia, max(1, len(ia) // _CHUNK)) if len(ia) else ():
+        low, high = a_low[chunk], a_high[chunk]
+        near = ib[_reach(b_low[ib], b_high[ib], low.min(axis=0), high.max(axis=0))]
+        i, j = np.nonzero(_reach(low[:, None], high[:, None], b_low[near], b_high[near]))
         first.append(chunk[i])
-        second.append(ib[j])
-    return np.concatenate(first), np.concatenate(second)
+        second.append(near[j])
+    i, j = np.concatenate(first), np.concatenate(second)
+    order = np.lexsort((j, i))
+    return i[order], j[order]
 
 
 def _edge_face_hits(x: Floats, edges: NDArray, faces: NDArray) -> tuple[int, int, float | None] | None:

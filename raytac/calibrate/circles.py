@@ -1,4 +1,4 @@
-"""Contact circles found in images of ball presses: where the colour steps most along the whole circle.
+"""Contact circles in images of ball presses: where the colour changes most along a circle.
 
 With D the image minus that of the untouched sensor, the score of a circle is the mean over its angles of the step |D(r − δ) − D(r + δ)|,
 Euclidean over the channels [levels]. The shading of a pressed ball is strongest at the rim of its contact and falls off within the
@@ -42,7 +42,9 @@ class FoundCircles:
 
 
 def find_circles(presses: RealPresses, pixel_pitch: float) -> FoundCircles:
-    """The contact circle of every press, without labels; ``pixel_pitch`` [m]: a contact is not wider than its ball.
+    """The contact circle of every press, without labels.
+
+    ``pixel_pitch`` [m]: a contact is not wider than its ball.
 
     Raises InputError for a ball whose contact could be wider than the image.
     """
@@ -63,7 +65,7 @@ def find_circles(presses: RealPresses, pixel_pitch: float) -> FoundCircles:
 
 
 def with_found_circles(presses: RealPresses, pixel_pitch: float) -> tuple[RealPresses, np.ndarray]:
-    """The presses with circles found where they have none, and which of those are doubtful, (N,) bool."""
+    """The presses with a circle each, and a mask of those whose circle is doubtful, (N,) bool."""
     unknown = np.asarray(np.isnan(presses.circles).any(axis=1))
     doubtful = np.zeros(len(presses), bool)
     if not unknown.any():
@@ -75,7 +77,10 @@ def with_found_circles(presses: RealPresses, pixel_pitch: float) -> tuple[RealPr
 
 
 def circle_score(change: np.ndarray, circles: np.ndarray) -> np.ndarray:
-    """Mean colour step [levels] across each of ``circles`` (N, 3) in ``change`` (H, W, 3); −1 where too little of one is in the image."""
+    """Mean colour step [levels] across each of ``circles`` (N, 3) in ``change`` (H, W, 3).
+
+    −1 where too little of a circle is in the image.
+    """
     x, y, r = np.asarray(circles, dtype=float).T[..., None]
     angle = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
     sides, valid = [], True
@@ -90,7 +95,7 @@ def circle_score(change: np.ndarray, circles: np.ndarray) -> np.ndarray:
 
 
 def _first_guess(change: np.ndarray, limit: float) -> np.ndarray:
-    """Circle of the centroid and the area of the pixels that changed by more than a third of the most."""
+    """Circle of the pixels that changed by more than a third of the most: centroid and area."""
     size = np.linalg.norm(change, axis=-1)
     strong = size > np.percentile(size, 99.5) / 3
     row, column = np.nonzero(strong)
@@ -115,7 +120,10 @@ def _climb(change: np.ndarray, circle: np.ndarray, limit: float) -> tuple[np.nda
 
 
 def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bilinear values at pixel positions (first pixel's centre at 0.5), and which of them lie in the image."""
+    """Bilinear values at pixel positions, and a mask of those in the image.
+
+    The first pixel's centre is at 0.5.
+    """
     height, width = image.shape[:2]
     x, y = u - 0.5, v - 0.5
     inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)

@@ -1,4 +1,4 @@
-"""Joint fit of lights, response, imprint and contact circles to photographs of ball presses, with direct light as forward model.
+"""Joint fit of lights, response, imprint and circles to photographs, by direct light.
 
 Residuals are those of the presses with the real background B as flat field, and of the image at rest,
 
@@ -82,7 +82,7 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class FitState:
-    """State of a fit: lights and response, s of the imprint at its inner knots, circles (N, 3) [px]."""
+    """State of a fit: lights, response, s at the imprint's inner knots, circles (N, 3) [px]."""
 
     p: LightParameters
     slopes: np.ndarray
@@ -90,7 +90,7 @@ class FitState:
 
 
 class DirectFit:
-    """The least-squares problem. Pixels are those near the circles of ``shots``, which also are the prior of the circles."""
+    """Least-squares problem on the pixels near the circles of ``shots``, the circles' prior."""
 
     def __init__(
         self,
@@ -191,7 +191,7 @@ class DirectFit:
         return FitState(changed, slopes, circles)
 
     def inside_bounds(self, state: FitState) -> FitState:
-        """Every parameter moved to what a sensor accepts: LEDs in the case, fitted heights in ``HEIGHTS``, none negative."""
+        """Every parameter moved to what a sensor accepts: LEDs in the case, heights in ``HEIGHTS``."""
         p, half = state.p, 5e2 * np.array(self.sensor.case.size)
         leds, response = p.leds.copy(), p.response.copy()
         leds[:, 4], leds[:, 5] = np.clip(leds[:, 4], -1.4, 1.4), np.clip(leds[:, 5], 1.0, 15.0)
@@ -209,7 +209,7 @@ class DirectFit:
         return FitState(changed, state.slopes, circles)
 
     def residuals(self, state: FitState) -> tuple[np.ndarray, np.ndarray]:
-        """Levels by which the presses' pixels (M, 3) and the image at rest (K, 3) are off, not weighted."""
+        """Residuals [levels] of pressed pixels (M, 3) and the image at rest (K, 3), not weighted."""
         image, rest = self.images(state.p, self.total(state.p, self.light(state.p, self.geometry(state))))
         return image - self.real, rest - self.rest_real
 
@@ -277,7 +277,7 @@ class DirectFit:
         return jac.T, rest_jac.T, circles, (image, rest)
 
     def _by_geometry(self, p: LightParameters, leds: list[LedLight]) -> tuple[np.ndarray, np.ndarray]:
-        """Slopes (3, M, 3) of the linear light of presses by a pixel's point [1/m] and by its normal."""
+        """Slopes (3, M, 3) of the presses' linear light by a pixel's point [1/m] and normal."""
         by_point, by_normal = np.zeros((2, 3, len(self.press), 3))
         for led, power, layer in zip(leds, p.power, p.layer, strict=True):
             by_point -= 1e3 * led.by_led[:3, :, None] * power
@@ -288,7 +288,7 @@ class DirectFit:
     def _gains(
         self, p: LightParameters, image: np.ndarray, rest: np.ndarray, total: list[np.ndarray]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Slopes of levels by light pressed, by light at rest in the same pixels (negated), and of the rest image."""
+        """Slopes of levels by light pressed, by light at rest (negated), and of the rest image."""
         gamma, *stray, _, _ = p.response
         black = np.array(stray) * self.darkest**gamma
 
@@ -351,7 +351,7 @@ class DirectFit:
         return trial
 
     def solve(self, state: FitState, iterations: int, tick: Callable[[FitState, float], None] | None = None) -> FitState:
-        """Levenberg and Marquardt's method from ``state``; ``tick`` is called with every accepted state and its cost."""
+        """Levenberg and Marquardt's method from ``state``; ``tick(state, cost)`` at accepted steps."""
         damping, state, slow = 1e-2, self.inside_bounds(state), 0
         cost = self.cost(state, self.residuals(state))
         for _ in range(iterations):
@@ -374,7 +374,7 @@ class DirectFit:
 
 
 def _draw(rho: np.ndarray, settings: FitSettings, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Press, row and column of the pixels that count; ``rho`` (N, H, W): distances over radii. All where there are fewer than wanted."""
+    """Press, row and column of the pixels that count; ``rho`` (N, H, W): distances over radii."""
     rng, results = np.random.default_rng(seed), []
     for k, one in enumerate(rho):
         for low, high, wanted in zip((0.0, 1.0), (1.0, settings.reach), settings.samples, strict=True):

@@ -1,4 +1,4 @@
-"""Direct light of point LEDs on a Lambertian coat, in NumPy, with its derivatives: what a fit can afford thousands of times.
+"""Direct light of point LEDs on a Lambertian coat, with derivatives, in NumPy for fits.
 
 It is the diffuse part of the ray tracer's own sum (``raytac.optics.trace.direct``) with one point an LED and no visibility:
 
@@ -66,13 +66,19 @@ def led_light(seen: PixelGeometry, led: np.ndarray, reference: float) -> LedLigh
 
 
 def case_light(seen: PixelGeometry) -> np.ndarray:
-    """Irradiance (M,) of a case of even radiance 1 / π on the coat: the share of the hemisphere that lies below the pad, (1 − n_z) / 2."""
+    """Irradiance (M,) of a case of even radiance 1 / π on the coat, (1 − n_z) / 2.
+
+    It is the share of the hemisphere that lies below the pad.
+    """
     return 0.5 * (1 - seen.n[2])
 
 
 @dataclass(frozen=True)
 class Light:
-    """Light of every LED at power 1 by channel, each (L, M, 3): in the pixels of presses, in the same at rest, over the image at rest."""
+    """Light of every LED at power 1 by channel, each (L, M, 3).
+
+    In the pixels of presses, in the same pixels at rest, and over the image at rest.
+    """
 
     pressed: np.ndarray
     flat: np.ndarray

@@ -51,7 +51,7 @@ class Models:
     """Configuration of the ray tracer."""
 
     def circles(self, shots: Photographs) -> np.ndarray:
-        """Circles (N, 3) [px] of presses that were not fitted to, from their labels and the finished lights."""
+        """Circles (N, 3) [px] of presses that were not fitted, from labels and fitted lights."""
         own = dataclasses.replace(shots, background=self.rest)
         return refine_circles(self.fitted.sensor, own, self.fitted.state, device=self.device, tracing=self.tracing)
 
@@ -66,7 +66,7 @@ def check_fit(
     starts: int = 1,
     rounds: int = 0,
 ) -> None:
-    """Raise InputError for arguments that ``fit_models`` could not use, at once and not after a fit."""
+    """Raise InputError for arguments that ``fit_models`` could not use, before a fit."""
     for name, values, rule, choices in (
         ("modes", modes, "must be known modes", MODES),
         ("prior", () if prior is None else (prior,), "must be a known strength, or None to choose it", tuple(STRENGTHS)),
@@ -104,7 +104,7 @@ def fit_models(
     tracing: RayTraced | None = None,
     tick: Callable[[str, float], None] | None = None,
 ) -> Models:
-    """Fit ``modes`` to the presses of ``shots``, all with the imprint and the circles that the lights were fitted with.
+    """Fit ``modes`` to the presses of ``shots``, with imprint and circles of the lights' fit.
 
     ``prior`` names one of ``STRENGTHS``; None chooses it within ``shots``. ``shadow_table``: one of ``SHADOW_TABLES``. ``settle``: all
     modes have the image at rest of ``Photographs.settled``, and not the one photograph of it. Raises as ``check_fit`` and ``fit_lights``.
@@ -145,7 +145,7 @@ def fit_models(
 
 
 def images_of(mode: OpticalMode, sensor: SensorSpec, shots: Photographs, circles: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """8-bit images (N, H, W, 3) of balls pressed at ``circles`` (N, 3) [px] with the imprint ``slopes``."""
+    """8-bit images (N, H, W, 3) of balls at ``circles`` (N, 3) [px], imprint ``slopes``."""
     grid, images = make_grid(sensor.gelpad, GRID_PITCH), []
     for k in range(len(circles)):
         surface = press_surface(sensor, grid, circles[k : k + 1], shots.radius[k : k + 1], slopes)

@@ -101,7 +101,9 @@ def press_samples(
     least: float = 5e-6,
     pitch: float = 0.06e-3,
 ) -> PressSamples:
-    """Samples within ``reach`` radii of the ``circles`` (N, 3) [px] of ``shots``, whose imprints have the ``slopes`` of ``imprint``.
+    """Samples within ``reach`` radii of the ``circles`` (N, 3) [px] of ``shots``.
+
+    Their imprints have the ``slopes`` of ``imprint``.
 
     ``least``: displacement [m] from which a pixel is a sample. ``pitch``: spacing of the pad's nodes [m], about a pixel's.
     """
@@ -131,7 +133,9 @@ def press_samples(
 def fit_table(
     sensor: SensorSpec, background: np.ndarray, samples: PressSamples, settings: TableSettings = TableSettings()
 ) -> PolyTable:
-    """Taxim table of ``samples`` over the real ``background`` (H, W, 3) [levels], with the sheets of ``two_sheets``.
+    """Taxim table of ``samples`` over the real ``background`` (H, W, 3) [levels].
+
+    Its sheets are those of ``two_sheets``.
 
     It has no shadows: photographs of balls say too little about them.
     """
@@ -160,7 +164,9 @@ def with_cast_shadows(
     settings: BakeSettings | None = None,
     tick: Callable[[int], None] | None = None,
 ) -> PolyTable:
-    """``table`` with a shadow table of pins and balls, rendered by the ray tracer under the fitted lights of ``lit``.
+    """``table`` with a shadow table of pins and balls.
+
+    The ray tracer renders them under the fitted lights of ``lit``.
 
     The table's background is their flat field, so that both tables are differences in levels from one image by one response. ``tick`` is
     called with the number of images rendered so far.
@@ -188,7 +194,10 @@ def fit_mlp(
     settings: MlpSettings = MlpSettings(),
     tick: Callable[[int], None] | None = None,
 ) -> MlpWeights:
-    """Network of ``samples`` over the real ``background`` (H, W, 3) [levels]; ``tick`` is called with the number of passes done so far."""
+    """Network of ``samples`` over the real ``background`` (H, W, 3) [levels].
+
+    ``tick`` is called with the number of passes done so far.
+    """
     rng = np.random.default_rng(seed)
     height, width = background.shape[:2]
     chosen = rng.permutation(len(samples.row))[: settings.samples]
@@ -249,7 +258,7 @@ def with_shading(
     settings: ShadingSettings = ShadingSettings(),
     tracing: RayTraced | None = None,
 ) -> SensorSpec:
-    """The sensor with the colour shading that brings its image at rest to ``background`` (H, W, 3) [levels].
+    """The sensor with the colour shading that gives ``background`` (H, W, 3) [levels] at rest.
 
     ``background`` covers the camera's whole image. Least squares of the logarithm of the quotient, weighted so that residuals are levels
     of the image to first order. ``tracing``: how rays are traced. Raises InputError: more than half of a channel of ``background`` is not

@@ -1,4 +1,6 @@
-"""Imprint of a ball in a calibration: one radial profile of slopes about each contact circle, shared by all presses.
+"""Imprint of a ball: one radial profile of slopes about each contact circle.
+
+All presses of a calibration share it.
 
 Photographs show where a ball touched, but not how the gel around it deformed. So the slope of the coat is a free function of the
 distance ρ = t a from the ball's axis over the contact radius a, fitted with the lights:
@@ -30,7 +32,10 @@ _TABLE = np.linspace(0, KNOTS[-1], 751)
 
 @dataclass(frozen=True)
 class PixelGeometry:
-    """Coat that pixels see: points ``p`` [m] and normals ``n`` towards the camera, each (3, M), pad frame."""
+    """Coat that pixels see, pad frame: points ``p`` [m] and normals ``n``, each (3, M).
+
+    Normals point towards the camera.
+    """
 
     p: np.ndarray
     n: np.ndarray
@@ -51,7 +56,7 @@ def _heights(slopes: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 
 def circles_on_pad(sensor: SensorSpec, circles: np.ndarray, ball_radius: np.ndarray) -> np.ndarray:
-    """x, y and radius [m] in the pad frame of circles x, y, radius [px of the sensor's resolution], (N, 3).
+    """x, y and radius [m] in the pad frame of circles (N, 3) [px of the sensor's resolution].
 
     A circle in the image is that of the rim, which lies about a² / 2R nearer to the camera than the pad at rest.
     """
@@ -77,7 +82,9 @@ def pixel_geometry(
     ball_radius: np.ndarray,
     slopes: np.ndarray,
 ) -> PixelGeometry:
-    """Coat seen by the pixels ``u``, ``v`` [px of the sensor's resolution] (M,) of the presses ``press`` (M,).
+    """Coat seen by the pixels ``u``, ``v`` (M,) of the presses ``press`` (M,).
+
+    Pixels are those of the sensor's resolution.
 
     ``circles`` (N, 3) [px], ``ball_radius`` (N,) [m]; ``slopes``: s at the inner ``KNOTS``. Where ``press`` is −1 the pad is at rest.
     The ray is met by iterating its height; slopes of the view are below 0.4, so that six steps leave less than a micrometre.
@@ -112,7 +119,9 @@ def pixel_geometry(
 def press_surface(
     sensor: SensorSpec, grid: PadGrid, circles: np.ndarray, ball_radius: np.ndarray, slopes: np.ndarray
 ) -> GelSurface:
-    """The pad under every ball as a batch of surfaces on ``grid``; arguments as for ``pixel_geometry``.
+    """The pad under every ball as a batch of surfaces on ``grid``.
+
+    Arguments as of ``pixel_geometry``.
 
     Raises InputError: a contact circle as wide as its ball.
     """

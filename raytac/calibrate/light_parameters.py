@@ -1,4 +1,6 @@
-"""Parameters of a fit of lights: place, aim, lobe, height and power of every LED, glow of the case, response; and ties between LEDs.
+"""Parameters of a fit of lights: LEDs, glow of the case, response; and ties between LEDs.
+
+An LED has place, aim, lobe, height and power.
 
 A press says something only about the light that reaches it, so LEDs far from all presses are poorly known. Ties carry over from those
 nearby: LEDs of one side are of one kind, and stand mirrored about the middle of their wall.
@@ -52,7 +54,10 @@ class LightParameters:
 
     @classmethod
     def of(cls, sensor: SensorSpec, background: np.ndarray) -> LightParameters:
-        """Those of a sensor, whose image at rest is ``background`` [levels]; InputError for a layer that is no camera channel."""
+        """Parameters of a sensor, whose image at rest is ``background`` [levels].
+
+        InputError for a layer that is no camera channel.
+        """
         leds, power = [], []
         for led in sensor.lights.leds:
             if led.layer not in CHANNELS:
@@ -97,14 +102,17 @@ _GLOW = np.pi * REFERENCE_DISTANCE**2
 
 
 def full_scale(sensor: SensorSpec) -> np.ndarray:
-    """Full scales that a coat at ``REFERENCE_DISTANCE`` shows of an LED of 1 W/sr by its diffuse lobe, by channel (3,)."""
+    """Diffuse light [full scales] (3,) of an LED of 1 W/sr at ``REFERENCE_DISTANCE``."""
     coat, response = sensor.coat, sensor.response
     diffuse = (1 - coat.specular) * np.array(coat.reflectance) / np.pi
     return response.gain * np.array(response.white_balance) * diffuse / REFERENCE_DISTANCE**2
 
 
 def with_parameters(sensor: SensorSpec, p: LightParameters, background: np.ndarray) -> SensorSpec:
-    """The sensor with fitted lights and response, without colour shading, not checked; ``background`` as of ``LightParameters.of``."""
+    """The sensor with fitted lights and response, without colour shading, not checked.
+
+    ``background`` as of ``LightParameters.of``.
+    """
     gamma, *stray, a1, a2 = map(float, p.response)
     black = np.array(stray) * darkest(background, gamma)
     black_level = tuple(map(float, black))
@@ -118,7 +126,9 @@ def darkest(background: np.ndarray, gamma: float) -> np.ndarray:
 
 
 def leds_split(sensor: SensorSpec, count: int) -> LightsSpec:
-    """Start of a fit: ``count`` LEDs in place of each of the sensor's own, side by side over ``SPREAD`` times its width.
+    """Start of a fit: ``count`` LEDs in place of each of the sensor's own.
+
+    They stand side by side over ``SPREAD`` times its width.
 
     What would stick out of the case's walls is moved inside. Raises InputError unless ``count`` is a whole number >= 1.
     """
@@ -145,7 +155,9 @@ def leds_split(sensor: SensorSpec, count: int) -> LightsSpec:
 
 
 def leds_at_walls(sensor: SensorSpec, sides: str) -> LightsSpec:
-    """A start for a fit: LEDs along the walls, near the gel's height, aimed across the pad and towards the camera.
+    """Start of a fit: LEDs along the walls, near the gel's height.
+
+    They are aimed across the pad and towards the camera.
 
     Raises InputError unless ``sides`` is three whole numbers >= 1 joined by commas.
     """
@@ -184,7 +196,10 @@ LEAST = 1.0
 
 @dataclass(frozen=True)
 class Ties:
-    """Beliefs about a fit's vector x: ``matrix`` x is about ``offset``, (T, n) and (T,), in standard deviations."""
+    """Beliefs about a fit's vector x: ``matrix`` x is about ``offset``, (T, n) and (T,).
+
+    Both are in standard deviations.
+    """
 
     matrix: np.ndarray
     offset: np.ndarray
@@ -195,7 +210,9 @@ class Ties:
 
 
 def side_ties(p: LightParameters, size: int) -> Ties:
-    """Ties of the LEDs of every layer, which stand on one side of the pad, mirrored about the line from the pad's middle to theirs.
+    """Ties of the LEDs of every layer, which stand on one side of the pad.
+
+    They are mirrored about the line from the pad's middle to theirs.
 
     An LED is tied to that which lies nearest to its mirror image at the start, if that holds of both. ``size`` is the vector's length,
     whose first entries are ``p.leds`` and ``p.power``.

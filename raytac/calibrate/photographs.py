@@ -1,4 +1,4 @@
-"""Photographs of ball presses, as floats in 8-bit levels, and what those levels mean in linear light."""
+"""Photographs of ball presses as floats in 8-bit levels, and their linear light."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ class Photographs:
         return dataclasses.replace(self, presses=self.presses[index], circles=self.circles[index], radius=self.radius[index])
 
     def settled(self, sensor: SensorSpec) -> Photographs:
-        """The same with another ``background``: whole levels of the mean of it and of the presses' pixels beyond ``FAR`` radii.
+        """The same with another ``background``, in whole levels.
+
+        It is the mean of it and of the presses' pixels beyond ``FAR`` radii.
 
         One photograph of the sensor at rest holds that photograph's noise, and was taken at another time than the presses were.
         """
@@ -90,5 +92,8 @@ def photographs_of(presses: RealPresses, sensor: SensorSpec) -> Photographs:
 
 
 def read_photographs(data: Path, sensor: SensorSpec) -> Photographs:
-    """``photographs_of`` the presses of a data set that labels its circles; raises as that and ``read_presses``."""
+    """``photographs_of`` the presses of a data set that labels its circles.
+
+    Raises as that and ``read_presses``.
+    """
     return photographs_of(read_presses(data), sensor)

@@ -1,4 +1,4 @@
-"""Real images of ball presses, read from the three layouts that calibrations are published in.
+"""Real images of ball presses, read from three published layouts.
 
 - ``labels.csv`` (columns ``diameter``, ``index``, ``cx_px``, ``cy_px``, ``r_px``, and perhaps ``edge_score``, ``fully_visible``) beside
   ``background.png`` and ``DIAMETER_INDEX.png``, such as ``6.310mm_07.png``.
@@ -53,7 +53,7 @@ class RealPresses:
 
     @property
     def fully_visible(self) -> np.ndarray:
-        """True where all of the circle lies in the image, (N,) bool; False where the circle is unknown."""
+        """Mask (N,) of the circles that lie in the image; False where the circle is unknown."""
         width, height = self.resolution
         x, y, r = self.circles.T
         return (x - r >= 0) & (y - r >= 0) & (x + r <= width) & (y + r <= height)
@@ -213,7 +213,9 @@ Split = tuple[np.ndarray, np.ndarray]
 
 
 def by_press(count: int, folds: int) -> list[Split]:
-    """Splits into ``folds``: fold k tests every ``folds``-th of ``count`` presses from the k-th, so that neighbours of a scan are apart.
+    """Splits into ``folds``: fold k tests every ``folds``-th of ``count`` presses from the k-th.
+
+    So neighbours of a scan are apart.
 
     ``folds = count`` leaves one out. Raises InputError for fewer than two folds, or more folds than presses.
     """
@@ -224,7 +226,7 @@ def by_press(count: int, folds: int) -> list[Split]:
 
 
 def by_half(presses: RealPresses) -> list[Split]:
-    """Splits from the left half of the pad to the right one, and the reverse, by the circles' centres.
+    """Splits from the left half of the pad to the right one, and the reverse, by circle.
 
     Raises InputError for a half without a press.
     """
@@ -236,7 +238,9 @@ def by_half(presses: RealPresses) -> list[Split]:
 
 
 def shallow_to_deep(presses: RealPresses, share: float = 0.5) -> Split:
-    """Split from the shallower ``share`` of the presses to the deeper ones: depth over the ball's radius grows with the circle over it.
+    """Split from the shallower ``share`` of the presses to the deeper ones.
+
+    Depth over the ball's radius grows with the circle over it.
 
     Raises InputError for a share that leaves one side empty.
     """

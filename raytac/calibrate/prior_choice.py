@@ -1,4 +1,4 @@
-"""Strength of a fit's priors, chosen by cross-validation within the presses that are fitted to.
+"""Strength of a fit's priors, by cross-validation within the presses that are fitted.
 
 Weak priors let LEDs go where they explain the presses at hand best, and be wrong where no press was. So the presses at hand are cut into
 halves of the pad, along x and along y; direct light is fitted to each half with every candidate and tested on the other. Presses that a
@@ -48,7 +48,9 @@ def choose_strength(
     seed: int = 0,
     tick: Callable[[str, float], None] | None = None,
 ) -> tuple[str, dict[str, float]]:
-    """Name of the candidate chosen, and the error of each: mean absolute residual [levels] in contacts of other halves.
+    """Name of the candidate chosen, and the error of each.
+
+    The error is the mean absolute residual [levels] in contacts of other halves.
 
     Raises InputError for too few presses to halve.
     """
@@ -81,7 +83,7 @@ def choose_strength(
 
 
 def _halves(circles: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(fitted, tested): the half with the smaller x and the other, the reverse, and the same by y."""
+    """(fitted, tested) pairs: the halves by x and by y, each in both directions."""
     splits = []
     for axis in (0, 1):
         order = np.argsort(circles[:, axis], kind="stable")

@@ -63,13 +63,16 @@ def brightened(problem: DirectFit, state: FitState) -> FitState:
 
 
 def first_state(sensor: SensorSpec, shots: Photographs, settings: FitSettings, seed: int) -> FitState:
-    """Start of a fit: the sensor's own lights, brightened, and the rigid pad's imprint at the labelled circles."""
+    """Start of a fit: the sensor's own lights, brightened, and the rigid pad's imprint.
+
+    The imprint lies at the labelled circles.
+    """
     begin = FitState(LightParameters.of(sensor, shots.background), RIGID_PAD.copy(), shots.circles.copy())
     return brightened(DirectFit(sensor, shots, begin, settings, factor=FACTOR, seed=seed), begin)
 
 
 def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, tracing: RayTraced) -> Light:
-    """Light of every LED at power 1 that the ray tracer adds to direct light, at ``problem``'s pixels."""
+    """Light of LEDs at power 1 that the ray tracer adds to direct light, at the fit's pixels."""
     sensor, p = problem.sensor, state.p
     unit = dataclasses.replace(p, power=np.ones_like(p.power))
     lit = dataclasses.replace(sensor, lights=unit.lights(sensor))
@@ -97,7 +100,9 @@ def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, trac
 def extra_light(
     problem: DirectFit, state: FitState, grid: PadGrid, device: str, tracing: RayTraced, *, slopes: bool = True
 ) -> ExtraLight:
-    """The defect with its slopes by the LEDs' places and heights, where shadows are cast and ``slopes`` asked for.
+    """The defect, and its slopes by the LEDs' places and heights.
+
+    Slopes where shadows are cast and ``slopes`` is asked for.
 
     Every LED has a layer of its own, so that all move in one rendering: eight more give all slopes, by central differences and without
     inter-reflection, which changes slowly.
@@ -176,7 +181,7 @@ def fit_lights(
 
 
 def _perturbed(problem: DirectFit, state: FitState, rng: np.random.Generator) -> FitState:
-    """The same with every LED elsewhere: by 1.5 mm, 0.2 rad and half a lobe's exponent (standard deviations)."""
+    """The same with every LED elsewhere: 1.5 mm, 0.2 rad, half a lobe's exponent (sigma)."""
     leds = state.p.leds + rng.normal(size=state.p.leds.shape) * START_SPREAD
     return problem.inside_bounds(dataclasses.replace(state, p=dataclasses.replace(state.p, leds=leds)))
 
@@ -191,7 +196,10 @@ def refine_circles(
     seed: int = 0,
     tracing: RayTraced | None = None,
 ) -> np.ndarray:
-    """Circles (N, 3) [px] of presses that the lights were not fitted to, from their labels and with the finished lights fixed."""
+    """Circles (N, 3) [px] of presses that the lights were not fitted to.
+
+    They follow from their labels and the finished lights.
+    """
     all_fixed = FitSettings(fixed=tuple(SIGMA))
     own = FitState(state.p, state.slopes, shots.circles.copy())
     problem = DirectFit(sensor, shots, own, all_fixed, factor=FACTOR, seed=seed)

@@ -1,4 +1,4 @@
-"""The ``raytac`` command: one subcommand a file; errors of the user's making are one line, not a traceback."""
+"""The ``raytac`` command: one subcommand a file, and one line for an error of the user."""
 
 from __future__ import annotations
 

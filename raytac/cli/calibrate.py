@@ -1,4 +1,4 @@
-"""``raytac calibrate``: optics fitted to photographs of a real sensor, or constants of marker motion fitted to the soft pad."""
+"""``raytac calibrate``: fit optics to photographs, or marker motion to the soft pad."""
 
 from __future__ import annotations
 

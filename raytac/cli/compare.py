@@ -1,4 +1,4 @@
-"""``raytac compare``: what each optical mode costs, and how far it is from the converged reference."""
+"""``raytac compare``: time of each optical mode, and its error against the reference."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class CompareArgs(SolverOptions):
         return print_paths(written)
 
     def settings(self) -> CompareSettings:
-        """Settings that the options mean. Raises InputError for names or numbers that cannot be read."""
+        """Settings of the options. Raises InputError for names or numbers that cannot be read."""
         sizes = tuple(dict.fromkeys(parse_resolution(text) for text in parse_names(self.resolutions, "resolutions")))
         chosen = CompareSettings(
             sensor=self.sensor,

@@ -1,4 +1,4 @@
-"""``raytac compare-real``: every optical mode against photographs of a real sensor that it was not fitted to."""
+"""``raytac compare-real``: optical modes against photographs that they were not fitted to."""
 
 from __future__ import annotations
 

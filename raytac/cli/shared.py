@@ -1,4 +1,4 @@
-"""Options that several commands have, and the data set that ``calibrate`` and ``compare-real`` read."""
+"""Options of several commands, and the data set of ``calibrate`` and ``compare-real``."""
 
 from __future__ import annotations
 
@@ -106,7 +106,9 @@ class FitOptions(CommonOptions):
 
 
 def chosen_physics(physics: str | None, level: str | None, scene: PressScene | TaskScene) -> PhysicsConfig:
-    """Physics that ``--physics`` and ``--level`` name: with a level alone ``ipc``, with neither as the scene says, else ``rigid``.
+    """Physics that ``--physics`` and ``--level`` name.
+
+    With a level alone ``ipc``, with neither as the scene says, else ``rigid``.
 
     Raises:
         InputError: an unknown name, or a level of a physics that has none. SpecError: an unknown name in the scene.

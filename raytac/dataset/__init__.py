@@ -1,4 +1,4 @@
-"""Data sets of presses: planned from a sweep, rendered in shards on one machine or on Ray, checked, and read back."""
+"""Data sets of presses: plan, render in shards (on one machine or on Ray), check, read."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""A contact sheet: the first presses of a data set at a glance, images over maps of their indentation, with a scale."""
+"""A contact sheet: the first presses of a data set, images over maps of their indentation."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def contact_sheet(data: PressDataset, count: int = 24, columns: int = 6) -> np.n
 
 
 def contact_figure(data: PressDataset, count: int = 24, columns: int = 6) -> Figure:
-    """Figure of the first ``count`` presses: number, object, depth, image and indentation of the pad.
+    """Figure of the first ``count`` presses: number, object, depth, image and indentation.
 
     All maps have one colour scale, from 0 (what comes up counts as 0) to the greatest indentation shown.
 

@@ -1,4 +1,4 @@
-"""``dataset.json`` and ``README.md``: what a data set says of itself, without any path of the machine that made it."""
+"""``dataset.json`` and ``README.md`` of a data set, without any path of the machine."""
 
 from __future__ import annotations
 

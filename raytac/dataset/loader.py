@@ -1,4 +1,7 @@
-"""``PressDataset``: presses of a data set by number, as dictionaries of arrays; needs NumPy and pyarrow alone."""
+"""``PressDataset``: presses of a data set by number, as dictionaries of arrays.
+
+It needs NumPy and pyarrow alone.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,9 @@ from raytac.errors import InputError
 
 
 class PressDataset:
-    """Sound presses of a data set; what ``torch.utils.data.DataLoader`` takes as a map-style data set, without PyTorch.
+    """Sound presses of a data set, as a map-style data set of PyTorch has them.
+
+    ``torch.utils.data.DataLoader`` takes it; PyTorch is not needed.
 
     .. code-block:: python
 
@@ -93,7 +98,10 @@ class PressDataset:
         return arrays | {name: np.asarray(values[i]) for name, values in self._columns.items()}
 
     def shared(self, i: SupportsIndex) -> dict[str, np.ndarray]:
-        """Arrays that all presses of press ``i``'s shard share: grid, height and image at rest. Errors as for ``data[i]``."""
+        """Arrays that all presses of press ``i``'s shard share: grid, height and image at rest.
+
+        Errors as for ``data[i]``.
+        """
         shard = self._shard(self._shards[self._place(i)])
         return {name: np.array(shard[name]) for name in self.description["arrays_of_a_shard"]}
 
@@ -155,7 +163,10 @@ def _shard_files(folder: Path, table: Any, sensors: Mapping[str, Any]) -> dict[s
 
 
 def _declared(description: dict[str, Any], file: _ShardFile) -> tuple[dict[str, ArrayKind], dict[str, int]]:
-    """Kinds of the arrays of a shard as ``dataset.json`` has them, with its sensor's shapes; and the sizes that are known."""
+    """Kinds of a shard's arrays as in ``dataset.json``, and the sizes that are known.
+
+    Shapes are those of its sensor.
+    """
     own: dict[str, Any] = description["sensors"][file.sensor]["arrays"]
     declared = {**description["arrays"], **description["arrays_of_a_shard"]}
     kinds = {name: ArrayKind(item["dtype"], tuple(own.get(name, item["shape"])), "", "") for name, item in declared.items()}

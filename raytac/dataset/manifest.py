@@ -1,4 +1,7 @@
-"""``manifest.parquet``: one row a press, failed or not, with its parameters, its forces and where its arrays are."""
+"""``manifest.parquet``: one row a press, with parameters, forces and place of its arrays.
+
+Failed presses have rows too.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ def check_pyarrow() -> None:
 
 
 def write_manifest(folder: Path, records: Iterable[ShardRecord]) -> Path:
-    """Write the rows of shards, in the order given; units and meanings are in the fields' metadata.
+    """Write the rows of shards in the order given; fields' metadata hold units and meanings.
 
     Raises:
         InputError: a row has a value of the wrong kind.

@@ -117,7 +117,7 @@ class DatasetPlan:
         return -(-self.sweep.count // self.sweep.shard_size)
 
     def variant(self, shard: int) -> tuple[int, int]:
-        """Number of the sensor that a shard is pressed into, and of its drawn copy: shards take turns."""
+        """Number of the sensor of a shard, and of its drawn copy: shards take turns."""
         which = shard % (len(self.sweep.sensors) * self.sweep.variants)
         return which % len(self.sweep.sensors), which // len(self.sweep.sensors)
 
@@ -163,7 +163,7 @@ class DatasetPlan:
     # --- sensors ---------------------------------------------------------------------------------------------------------------
 
     def sensor_options(self, num_envs: int) -> dict[str, Any]:
-        """Keyword arguments of the ``TactileSensor`` that gives what is kept, but for sensor and device."""
+        """Keyword arguments of the ``TactileSensor`` of a sweep, but for sensor and device."""
         sweep = self.sweep
         return {
             "physics": self.physics,
@@ -186,7 +186,7 @@ class DatasetPlan:
         return make_grid(sensor.gelpad, pitch)
 
     def array_shapes(self, sensor: SensorSpec, kinds: Mapping[str, ArrayKind] = ARRAYS) -> dict[str, tuple[int, ...]]:
-        """Shape of every array of one press into a sensor, by name; with ``SHARED`` of those that a shard holds once."""
+        """Shape of every array of one press, by name; and ``SHARED`` of those once a shard."""
         width, height = self.resolution(sensor)
         rows, columns = self.grid(sensor).shape
         sizes = {"H": height, "W": width, "Ny": rows, "Nx": columns, "M": sensor.markers.rows * sensor.markers.columns}
@@ -195,7 +195,7 @@ class DatasetPlan:
         return {name: tuple(sizes[n] if isinstance(n, str) else n for n in array.shape) for name, array in kept.items()}
 
     def press_bytes(self, sensor: SensorSpec) -> int:
-        """Bytes on disk of one press into a sensor, not compressed, without the arrays that a shard holds once."""
+        """Bytes on disk of one press, not compressed, without the arrays once a shard."""
         return _bytes(self.array_shapes(sensor), ARRAYS)
 
     def shard_bytes(self, shard: int) -> int:
@@ -205,7 +205,10 @@ class DatasetPlan:
         return count * self.press_bytes(sensor) + _bytes(self.array_shapes(sensor, SHARED), SHARED)
 
     def total_bytes(self, without: Collection[int] = ()) -> int:
-        """Bytes on disk of all shards but those ``without``, as ``shard_bytes``; the time does not grow with their number."""
+        """Bytes on disk of all shards but those ``without``, as ``shard_bytes``.
+
+        The time does not grow with their number.
+        """
         kinds, last = len(self.sweep.sensors), self.shards - 1
         done = Counter(shard % kinds for shard in without)  # shards take turns over the sensors
         total = 0
@@ -260,7 +263,7 @@ class DatasetPlan:
                 raise self._error(f"{axis}_mm", ends, rule)
 
     def _check_markers(self, sensor: SensorSpec) -> None:
-        """Refuse shifts and turns of the pattern that take a marker out of the view, before one is drawn."""
+        """Refuse shifts and turns of the pattern that take a marker out of the view."""
         largest = self.randomization.markers
         if self.sweep.markers is not None and largest.moves_pattern:
             ends = np.array([(x, y, turn) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for turn in (-1.0, 0.0, 1.0)])
@@ -272,7 +275,7 @@ class DatasetPlan:
 
 
 def press_scene_of(scene: PressScene, ranges: Any) -> PressScene:
-    """A scene's object with the trajectory of a sweep: indent, then a shear and a twist where the sweep has any."""
+    """A scene's object with the trajectory of a sweep: indent, then shear and twist, if any."""
     stages = [StageSpec("indent", depth=ranges.depth[1])]
     if ranges.shear != (0.0, 0.0):
         stages.append(StageSpec("shear"))

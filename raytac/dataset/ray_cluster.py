@@ -1,4 +1,6 @@
-"""Shards on Ray: one worker a device; whoever started the run writes, so that workers need no disk in common.
+"""Shards on Ray, one worker a device.
+
+The process that started the run writes all files, so that workers need no disk in common.
 
 A worker that dies loses what it was rendering; Ray starts it again, and the shard is rendered once more. Results come back through Ray's
 object store and are written here alone, so that no press is lost and none is there twice.
@@ -38,7 +40,10 @@ class _Worker:
         return ""
 
     def render(self, shard: int) -> ShardResult | str:
-        """The shard, or an error's text: errors whose constructors take keywords do not travel between processes."""
+        """The shard, or an error's text.
+
+        Errors whose constructors take keywords do not travel between processes.
+        """
         try:
             return replace(self._renderer.render(shard), worker=f"{os.uname().nodename}:{os.getpid()}")
         except RaytacError as error:
@@ -48,7 +53,7 @@ class _Worker:
 def render_on_ray(
     job: RenderJob, shards: Sequence[int], *, workers: int | None = None, address: str | None = None
 ) -> Iterator[ShardResult]:
-    """Render shards on a Ray cluster, or on a local Ray that ends with the run; they come as they are done.
+    """Render shards on a Ray cluster, or on a local Ray; they come as they are done.
 
     Args:
         job: what to render. With ``device="auto"`` a worker has a GPU if the cluster has any, else the CPU.

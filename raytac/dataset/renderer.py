@@ -1,4 +1,4 @@
-"""From the presses of a shard to its arrays: what one worker does, on whatever machine it runs."""
+"""From the presses of a shard to its arrays: the work of one worker."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class _Built:
 
 
 class ShardRenderer:
-    """Renders shards of one plan, in any order; what a shard holds does not depend on those before.
+    """Renders shards of one plan, in any order; a shard does not depend on those before.
 
     .. code-block:: python
 
@@ -154,7 +154,7 @@ class ShardRenderer:
         return frame, reasons
 
     def _own(self, presses: Presses, batch: int | None = None) -> dict[str, Any]:
-        """Arguments of ``TactileSensor.press``; environments without a press are lost from the start."""
+        """Arguments of ``TactileSensor.press``; environments without a press fail from the start."""
         batch = self.job.batch if batch is None else batch
 
         def filled(values: np.ndarray, rest: float = 0.0) -> np.ndarray:
@@ -234,7 +234,7 @@ def _figures(frame: TactileFrame, b: int) -> Row:
 
 
 def _not_finite(arrays: Mapping[str, np.ndarray]) -> str:
-    """Name of an array of a press that holds a number that is not finite and ought to be; empty if none."""
+    """Name of an array of a press with a number that should be finite and is not; or empty."""
     lost = arrays.get("marker_visible")
     for name, values in arrays.items():
         if values.dtype.kind != "f":

@@ -1,4 +1,4 @@
-"""Render a data set into a folder: what is missing or damaged there, on the engine of one's choice."""
+"""Render a data set into a folder: the shards that are missing or damaged, on any engine."""
 
 from __future__ import annotations
 
@@ -162,7 +162,10 @@ def _ordered(records: dict[int, ShardRecord]) -> list[ShardRecord]:
 
 
 def _check_same(folder: Path, plan: DatasetPlan, store: ShardStore) -> None:
-    """Refuse a folder with shards of something else; a description without any shard is of a run that rendered nothing."""
+    """Refuse a folder with shards of another plan.
+
+    A description without any shard is of a run that rendered nothing.
+    """
     shards = folder / FOLDER
     if os.path.lexists(shards) and not shards.is_dir():
         raise InputError("out", value=shards, rule="must be a folder, or not exist")
@@ -180,7 +183,7 @@ def _check_same(folder: Path, plan: DatasetPlan, store: ShardStore) -> None:
 
 
 def _check_room(folder: Path, plan: DatasetPlan, records: dict[int, ShardRecord], say: Callable[[str], object]) -> None:
-    """Compare what is missing with the free disk; arrays that are to be compressed are counted in full."""
+    """Compare the size of missing shards with the free disk, as if nothing were compressed."""
     need, free, missing = plan.total_bytes(without=records), shutil.disk_usage(folder).free, plan.shards - len(records)
     if records:
         say(f"{len(records)} of {plan.shards} shards are there and whole")

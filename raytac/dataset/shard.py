@@ -1,4 +1,4 @@
-"""Shards on disk: a whole ``.npz`` of arrays and a ``.json`` of rows each, checked by SHA-256."""
+"""Shards on disk: a ``.npz`` of arrays and a ``.json`` of rows each, checked by SHA-256."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class ShardStore:
         self.folder, self._plan, self._compress = Path(folder), plan_sha256, compress
 
     def write(self, result: ShardResult) -> ShardRecord:
-        """Keep a shard; its ``.json`` comes last, so that an interrupt leaves no shard that looks finished."""
+        """Keep a shard; its ``.json`` comes last, so that an interrupt leaves none half finished."""
         (self.folder / FOLDER).mkdir(parents=True, exist_ok=True)
         data, file = b"", ""
         arrays = self._path(result.shard, "npz")
@@ -63,7 +63,7 @@ class ShardStore:
         return record
 
     def read(self, shard: int) -> ShardRecord | str:
-        """The record of a shard whose files are whole; else what is wrong with them, ``missing`` if there are none."""
+        """The record of a whole shard; else a text that says what is wrong, or ``missing``."""
         path, arrays = self._path(shard, "json"), self._path(shard, "npz")
         try:
             kept = json.loads(read_regular(path))
@@ -114,7 +114,7 @@ def _rows_digest(rows: list[Row]) -> str:
 
 
 def is_shard_file(name: str) -> bool:
-    """True for a path that a data set gives its shards: in the folder of the shards and nowhere else."""
+    """True for a path of a shard in a data set: in the folder of the shards alone."""
     return _FILE.fullmatch(name) is not None
 
 
@@ -139,7 +139,9 @@ def open_shard(
     sizes: Mapping[str, int] | None = None,
     sha256: str | None = None,
 ) -> tuple[dict[str, np.ndarray], bool]:
-    """Arrays of an ``.npz``, mapped into memory if none is compressed, else read; and which of the two.
+    """Arrays of an ``.npz``, and True if they are mapped into memory.
+
+    They are if none is compressed; else they are read.
 
     Args:
         path: of the file.
@@ -195,7 +197,7 @@ def _start(stream: IO[bytes], member: zipfile.ZipInfo) -> int:
 def _header(
     stream: IO[bytes], kind: ArrayKind, sizes: dict[str, int], length: int
 ) -> tuple[tuple[int, ...], np.dtype, Literal["C", "F"], int]:
-    """Shape, type and order of the ``.npy`` of ``length`` bytes at the stream's place, and the length of its header.
+    """Shape, type and order of a ``.npy`` of ``length`` bytes, and the length of its header.
 
     Sizes that are named for the first time are noted in ``sizes``. Raises ``ValueError`` where it is not of this kind.
     """

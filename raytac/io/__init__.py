@@ -1,4 +1,4 @@
-"""Files: results written whole or not at all, caches, metrics, images and the options that all commands share."""
+"""Files: results that are whole or absent, caches, metrics, images, common options."""
 
 import lazy_loader
 

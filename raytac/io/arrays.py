@@ -1,4 +1,7 @@
-"""NumPy arrays as the contents of ``.npy`` and ``.npz`` files: no objects, and equal arrays give equal bytes."""
+"""NumPy arrays as the contents of ``.npy`` and ``.npz`` files.
+
+They hold no objects, and equal arrays give equal bytes.
+"""
 
 from __future__ import annotations
 

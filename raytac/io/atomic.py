@@ -36,7 +36,7 @@ def write_atomic(path: Path, data: bytes) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Synchronise the names in ``folder`` with the disk, so that a rename outlasts a loss of power."""
+    """Write the names in ``folder`` to the disk, so that a rename outlasts a loss of power."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(handle)
@@ -48,7 +48,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def open_regular(path: Path) -> io.BufferedReader:
-    """Open a regular file for reading; a pipe or a device of that name is an error and is not waited for.
+    """Open a regular file for reading; a pipe or a device of that name is an error.
 
     Raises:
         OSError: it does not exist, cannot be read, or is something else.

@@ -1,4 +1,6 @@
-"""The user's cache: what can be made again, kept between processes, and never used where it is damaged.
+"""The user's cache: what can be made again, kept between processes.
+
+A damaged entry is never used.
 
 A cache is a help and no need: one that cannot be written or read means work in memory, with a warning.
 """
@@ -29,7 +31,7 @@ def cache_folder(kind: str) -> Path | None:
 
 
 def read_cached(path: Path | None) -> bytes | None:
-    """Contents that ``keep_cached`` kept; None if there are none or, with a warning, if they are damaged."""
+    """Contents that ``keep_cached`` kept; None if there are none, or damaged ones (warns)."""
     if path is None:
         return None
     try:

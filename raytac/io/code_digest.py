@@ -16,7 +16,9 @@ WITHIN = ("raytac.gel", "raytac.optics", "raytac.shapes")
 
 
 def module_sources(roots: Iterable[str]) -> dict[str, Path]:
-    """Source files of ``roots`` and of all modules of the packages ``WITHIN`` that they import, also inside functions.
+    """Source files of ``roots`` and of all modules of ``WITHIN`` that they import.
+
+    Imports inside functions count.
 
     Roots that do not exist are left out. Imports are read from the sources; nothing is run except the ``__init__`` of packages.
     """

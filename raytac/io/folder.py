@@ -65,7 +65,7 @@ def result_folder(out: Path, owned: Iterable[str] = ()) -> Iterator[Path]:
 
 
 def _is_of_folder(error: OSError, folders: Iterable[Path]) -> bool:
-    """True if the error names a file in one of the folders, or names none and is an error of the disk."""
+    """True for an error of a file in one of the folders, or of the disk without a file."""
     if not isinstance(error.filename, str | bytes | os.PathLike):  # none, or the number of an open file
         return error.errno in DISK_ERRORS
     place = Path(os.path.abspath(os.fsdecode(error.filename)))
@@ -79,7 +79,7 @@ def _check_no_folders(out: Path, names: Iterable[str]) -> None:
 
 
 def _move(work: Path, old: Path, out: Path, owned: tuple[str, ...]) -> None:
-    """Move the files of ``work`` into ``out``; on an error all goes back as it was, from ``old``."""
+    """Move the files of ``work`` into ``out``; an error moves all back, from ``old``."""
     written = sorted((path.name for path in work.iterdir()), key=lambda name: name == "metrics.json")
     try:
         for name in sorted({*written, *owned}, key=lambda name: name != "metrics.json"):

@@ -1,4 +1,4 @@
-"""Images on disk: 8-bit PNG, linear OpenEXR with named channels, and sheets of several pictures."""
+"""Images on disk: 8-bit PNG, linear OpenEXR with named channels, sheets of pictures."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def write_exr(path: Path, channels: Mapping[str, np.ndarray], header: Mapping[st
 
 
 def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Channels by name, each shape (H, W), and the ``raytac:`` header attributes without their prefix.
+    """Channels by name, each (H, W), and ``raytac:`` header attributes without that prefix.
 
     Raises:
         InputError: the file is missing or is not an EXR file.
@@ -110,7 +110,7 @@ def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
 
 
 def write_sheet(pictures: list[Path], out: Path, *, gap: int = 24) -> None:
-    """Stack PNG files under each other, ``gap`` white pixels apart, narrower ones filled up with white on the right.
+    """Stack PNG files under each other, ``gap`` white pixels apart, white on the right.
 
     Raises:
         InputError: no pictures.

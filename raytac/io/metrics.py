@@ -27,7 +27,7 @@ _KEY = re.compile(r"[A-Za-z0-9_\-]+(\.[A-Za-z0-9_\-]+)*")
 
 
 def versions(distributions: Iterable[str] = VERSIONED) -> dict[str, str]:
-    """``versions.python`` and ``versions.<distribution>`` of what is installed; what is not is left out."""
+    """``versions.python`` and ``versions.<distribution>`` of what is installed."""
     result = {"versions.python": platform.python_version()}
     for name in distributions:
         try:

@@ -14,7 +14,10 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 
 @dataclass(frozen=True, kw_only=True)
 class CommonOptions:
-    """Base of an ``Args`` dataclass: ``@dataclass(frozen=True, kw_only=True) class Args(CommonOptions)``."""
+    """Base of an ``Args`` dataclass.
+
+    Write ``@dataclass(frozen=True, kw_only=True) class Args(CommonOptions)``.
+    """
 
     out: Path | None = None
     """Folder to write to, created if need be; a folder under runs/ named after the job if not given."""
@@ -37,7 +40,7 @@ def parse_resolution(text: str) -> tuple[int, int]:
 
 
 def parse_names(text: str, option: str, choices: tuple[str, ...] | None = None) -> tuple[str, ...]:
-    """``"sphere, coin"`` to ``("sphere", "coin")``: names joined by commas, each once, in the order given.
+    """``"sphere, coin"`` to ``("sphere", "coin")``: names joined by commas, each once.
 
     Raises:
         InputError: none, or one that is not in ``choices`` (None is any).

@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 
 class Progress(tqdm):
-    """A ``tqdm`` bar that writes plain lines where there is no terminal: into a log, a file or a pipe."""
+    """A ``tqdm`` bar that writes plain lines into a log, a file or a pipe."""
 
     def __init__(
         self, iterable: Any = None, *, desc: str, show: bool = True, interval: float = 5.0, file: Any = None, **options: Any

@@ -1,4 +1,4 @@
-"""Files with a digest of their own at the end, so that a damaged one is known before anything in it is used.
+"""Files that end with their own digest, so that damage is known before anything is used.
 
 The last 32 bytes are the SHA-256 of the file's name and of what comes before them: neither damage nor another entry's file under this name
 passes. ``numpy.load`` reads a sealed ``.npy`` or ``.npz`` all the same.
@@ -15,7 +15,10 @@ _SIZE = hashlib.sha256().digest_size
 
 
 class SealError(ValueError):
-    """A sealed file differs from its digest: it is empty, cut short, changed, or was written under another name."""
+    """A sealed file differs from its digest.
+
+    It is empty, cut short, changed, or was written under another name.
+    """
 
 
 def write_sealed(path: Path, data: bytes) -> None:

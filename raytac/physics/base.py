@@ -23,7 +23,9 @@ OfSurface = np.ndarray | Callable[[GelSurface], np.ndarray]
 
 
 class PadReading:
-    """B pads of one sensor at one instant, in a press or in a world; pad frame. Forces are those of all that touches, on the gel.
+    """B pads of one sensor at one instant, in a press or in a world; pad frame.
+
+    Forces are those of all that touches, on the gel.
 
     Attributes:
         failed: environments whose physics broke down, (B,), bool; their arrays hold NaN.
@@ -77,13 +79,16 @@ class PadReading:
 
     @cached_property
     def wrench(self) -> np.ndarray:
-        """Force on the pad [N] and its torque about the pad frame's origin [N m], (B, 6); NaN of a bare surface."""
+        """Force on the pad [N] and torque about the frame's origin [N m], (B, 6).
+
+        NaN of a bare surface.
+        """
         if self._wrench is None:
             return np.full((len(self.failed), 6), np.nan)
         return self._wrench(self.surface) if callable(self._wrench) else self._wrench
 
     def traction(self) -> np.ndarray:
-        """Traction on the pad [Pa], (B, Ny, Nx, 3), as ``TactileFrame.traction``; NaN if it is not known."""
+        """Traction on the pad [Pa], (B, Ny, Nx, 3), as ``TactileFrame.traction``; NaN if unknown."""
         if self._traction is None:
             return np.full((*self.surface.height.shape, 3), np.nan, np.float32)
         return self._traction(self.surface) if callable(self._traction) else self._traction
@@ -145,12 +150,17 @@ class Pad(Protocol):
         ...
 
     def object_height(self, surface: GelSurface) -> np.ndarray | None:
-        """Underside of the object at the surface's poses [m], (B, Ny, Nx), inf where it is not; None without an object."""
+        """Underside of the object at the surface's poses [m], (B, Ny, Nx).
+
+        inf where it is not; None without an object.
+        """
         ...
 
 
 class PhysicsConfig(Protocol):
-    """Configuration of one physics: a frozen dataclass that checks itself. ``raytac.physics.register`` makes it known by a name.
+    """Configuration of one physics: a frozen dataclass that checks itself.
+
+    ``raytac.physics.register`` makes it known by a name.
 
     A field ``level`` that is None is filled with the scene's, else ``coarse``.
     """

@@ -1,4 +1,4 @@
-"""Configurations of the physics that come with raytac; making one imports neither MuJoCo nor the solver."""
+"""Configurations of raytac's own physics; they import neither MuJoCo nor the solver."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Rigid:
-    """Rigid pad on MuJoCo: geometry and Gaussians give the gel's surface, a load law ties force to depth."""
+    """Rigid pad on MuJoCo: a load law ties force to depth, Gaussians give the gel's surface."""
 
     is_simulated: ClassVar[bool] = False
 
@@ -65,7 +65,10 @@ class Ipc:
         return f"ipc-{level if isinstance(level, str) else 'own'}"
 
     def build(self, spec: SensorSpec, press: PressScene, *, device: str = "auto", **settings: Any) -> SoftPad:
-        """The pad of a press; the solver traces no rays, so that CUDA needs no OptiX. See ``PhysicsConfig.build``."""
+        """The pad of a press, as ``PhysicsConfig.build``.
+
+        The solver traces no rays, so that CUDA needs no OptiX.
+        """
         from raytac.physics.soft.availability import check_solver
 
         check_solver("physics='ipc'")

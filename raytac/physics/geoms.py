@@ -1,4 +1,7 @@
-"""From the geoms of a MuJoCo model to the parts that the height-field code senses, so that any MuJoCo object can be pressed in."""
+"""From the geoms of a MuJoCo model to parts of the height-field code.
+
+So any MuJoCo object can be pressed in.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ GEOM_TYPES = ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "
 
 
 def body_parts(model: mujoco.MjModel, body: int | str, groups: Sequence[int] | None = None) -> tuple[Part, ...]:
-    """Parts of all geoms of one body, body frame: with ``pad_from_body`` they are what ``object_height`` takes.
+    """Parts of all geoms of one body, body frame; ``object_height`` takes them.
 
     Bodies without joints between them are separate bodies in MuJoCo too; give each its own pose. A model often has a coarse geom
     for collisions beside a fine one to look at: ``groups`` keeps only the geoms of these MuJoCo groups (0 to 5), None keeps all.
@@ -94,7 +97,10 @@ def _index(model: mujoco.MjModel, kind: mujoco.mjtObj, count: int, what: str, gi
 
 
 def _mesh(model: mujoco.MjModel, data: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) [m] and faces (F, 3) of a mesh, in the frame of the geom that shows it (MuJoCo has centred them)."""
+    """Vertices (V, 3) [m] and faces (F, 3) of a mesh, in the frame of the geom that shows it.
+
+    MuJoCo has centred them.
+    """
     vertex, face = int(model.mesh_vertadr[data]), int(model.mesh_faceadr[data])
     vertices = model.mesh_vert[vertex : vertex + int(model.mesh_vertnum[data])]
     return vertices, model.mesh_face[face : face + int(model.mesh_facenum[data])]

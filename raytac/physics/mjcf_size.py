@@ -33,7 +33,7 @@ _ATTRIBUTE = re.compile(r"(?<![^\s=\"'])([^\s=\"']++)\s*+=\s*+(?:\"([^\"]*+)\"|'
 
 
 def check_mjcf_size(path: str | Path) -> None:
-    """Refuse a model that asks, with the files that it includes, for more copies or nodes than the limits above.
+    """Refuse a model that asks, with its includes, for more copies or nodes than the limits.
 
     Raises:
         InputError: the model asks for too much, is too long or nested too deep, or names a file that is none, such as a device. What else

@@ -1,4 +1,4 @@
-"""Pads of a press: per-environment targets, checks of the trajectory, and the loop over its stages that all pads share."""
+"""Pads of a press: targets by environment, checks of the trajectory, loop over its stages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ from raytac.specs.sensor import GelpadSpec, SensorSpec
 
 
 class PressTargets:
-    """Targets of B environments; a number that is not finite marks its environment as ``lost``: it fails from the start.
+    """Targets of B environments.
+
+    A number that is not finite marks its environment as ``lost``: it fails from the start.
 
     Attributes:
         offsets: added to the object's x, y [m], (B, 2).
@@ -108,7 +110,7 @@ class PressTargets:
         return np.where(self.lost if values.ndim == 1 else self.lost[:, None], 0.0, values)
 
     def start_error(self, b: int, error: InputError) -> InputError | SpecError:
-        """``error`` of environment ``b`` at its start, under what it does in its own way, or else the scene's file and key."""
+        """``error`` of environment ``b`` at its start, with its own target's name or the scene's."""
         own = self._own(b, ())
         if own is not None:
             return InputError(own[0], value=own[1], rule=f"in environment {b}, at the start: {error.rule}")
@@ -116,7 +118,7 @@ class PressTargets:
         return SpecError(error.rule, file=self._scene.source, key="object.position_mm", value=place)
 
     def stage_error(self, index: int, stage: StageSpec, b: int, error: InputError) -> InputError | SpecError:
-        """``error`` of environment ``b`` in a stage, under what it does in its own way, or else the scene's file and key.
+        """``error`` of environment ``b`` in a stage, with its own target's name or the scene's.
 
         Args:
             index: the stage's number in the scene, −1 if it is none of the scene's: then ``error`` stays as it is, if nothing is its own.
@@ -146,7 +148,10 @@ class PressTargets:
         return SpecError(kept + error.rule, file=self._scene.source, key=f"trajectory[{index}].{name}", value=value)
 
     def _own(self, b: int, kinds: Iterable[str]) -> tuple[str, object] | None:
-        """Name and value of what of its own took environment ``b`` where it is: in stages of ``kinds``, last first, then at the start."""
+        """Name and value of the target that took environment ``b`` where it is.
+
+        In stages of ``kinds``, last first, then at the start.
+        """
         for kind in kinds:
             values = self._own_targets.get(kind)
             if values is not None:
@@ -180,7 +185,7 @@ def _check_trajectory(scene: PressScene, gelpad: GelpadSpec, parts: Sequence[Par
 
 
 class PressPad(ABC):
-    """Base of the pads of a press: the object before the gel, and the loop over the stages of its trajectory.
+    """Base of the pads of a press: the object before the gel, and the loop over the stages.
 
     A subclass says where a press starts (``reset``), how the object moves through a stage (``begin``, ``advance``) and what is then
     to be read (``read``).
@@ -223,7 +228,7 @@ class PressPad(ABC):
 
     @abstractmethod
     def begin(self, index: int, stage: StageSpec, steps: int) -> None:
-        """Prepare a stage of ``steps`` readings; ``index``: its number in the scene, −1 if it is none of the scene's."""
+        """Prepare a stage of ``steps`` readings; ``index``: its number in the scene, or −1."""
 
     @abstractmethod
     def advance(self, stage: StageSpec, fraction: float) -> None:
@@ -234,7 +239,7 @@ class PressPad(ABC):
         """The pad as it is now; stage and scene are added by the loop over the stages."""
 
     def run(self, steps_per_stage: int = 1, *, progress: bool = False) -> Iterator[PadReading]:
-        """Readings along the trajectory: one before it (lifted by ``CLEARANCE``), then ``steps_per_stage`` through each stage.
+        """Readings: one lifted by ``CLEARANCE``, then ``steps_per_stage`` through each stage.
 
         Targets are reached in straight lines. An ``indent`` to a depth moves the object there; one to a force pushes until the contact
         balances it, and keeps that force through a shear or twist that follows. A ``release`` lifts the object ``CLEARANCE`` above the
@@ -253,7 +258,9 @@ class PressPad(ABC):
             yield from self._through(index, stage, steps_per_stage)
 
     def follow(self, stage: StageSpec, steps: int = 1) -> Iterator[PadReading]:
-        """Readings along one more stage, from wherever the pad is now: for a loop in which somebody else decides where to go next.
+        """Readings along one more stage, from wherever the pad is now.
+
+        For a loop in which somebody else decides where to go next.
 
         A pad that was not run yet starts above the gel. The readings are of no stage of the scene (their ``stage`` is −1). Nothing moves
         before the first is asked for; who stops asking leaves the pad where it is then, and may follow another stage from there.
@@ -269,14 +276,20 @@ class PressPad(ABC):
         yield from self._through(-1, stage, steps)
 
     def peak(self, readings: Iterable[PadReading]) -> PadReading:
-        """First of ``readings`` at the end of the scene's peak stage (the start, if it has none); later ones are not computed."""
+        """First of ``readings`` at the end of the scene's peak stage (the start, if it has none).
+
+        Later ones are not computed.
+        """
         for reading in readings:
             if reading.stage == self.scene.peak_stage and reading.fraction == 1.0:
                 return reading
         raise InputError("readings", value=self.scene.peak_stage, rule="hold none at the end of the scene's peak stage")
 
     def object_height(self, surface: GelSurface) -> np.ndarray | None:
-        """Underside of the object at the surface's poses [m], (B, Ny, Nx), inf where it is not; None without an object."""
+        """Underside of the object at the surface's poses [m], (B, Ny, Nx).
+
+        inf where it is not; None without an object.
+        """
         if surface.pad_from_object is None:
             return None
         return object_height(self.parts, surface.pad_from_object, self.grid.x, self.grid.y)

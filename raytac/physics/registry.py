@@ -47,7 +47,7 @@ class _Scene(Protocol):
 
 
 def scene_physics(physics: PhysicsConfig | None, scene: _Scene) -> PhysicsConfig:
-    """Physics of a scene: the one that is asked for, else the one that the scene names, else ``rigid``.
+    """Physics of a scene: as asked for, else as the scene names, else ``rigid``.
 
     A ``level`` that is not given is the scene's, else the coarsest.
 

@@ -1,4 +1,4 @@
-"""Bake a table and write its folder: files as Taxim has them, coverage, error by scene against the ray tracer."""
+"""Bake a table and write its folder: Taxim's files, coverage, error by scene."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def run_bake(
     resolution: tuple[int, int] | None,
     start: float,
 ) -> list[Path]:
-    """Bake, keep the table in the cache, and write calibration files, coverage.png, sheet.png and metrics.json to ``out``.
+    """Bake, cache the table, and write calibration files, figures and metrics to ``out``.
 
     ``scenes`` are the presses on which the table is compared; ``start`` is ``time.perf_counter()`` at the beginning of the job. Nothing
     in ``out`` or in the cache changes until everything is computed. A cache that cannot be written is a warning. Returns the files written.
@@ -103,7 +103,7 @@ _DEGREES = ("#fdcc8a", "#74a9cf", "#045a8d")
 
 
 def write_coverage(path: Path, fit: BinFit, sensor: str) -> None:
-    """Samples of every bin, and the degree of its polynomial, over direction and magnitude of the slope."""
+    """Samples of every bin, and the degree of its polynomial, over the slope."""
     from matplotlib import rc_context
     from matplotlib.colors import ListedColormap, LogNorm
     from matplotlib.figure import Figure
@@ -134,7 +134,7 @@ def write_coverage(path: Path, fit: BinFit, sensor: str) -> None:
 
 
 def write_table_sheet(path: Path, errors: dict[str, dict[str, SceneError]]) -> None:
-    """Draw a row a scene: ray tracer, table, table with shadows, signed errors (mean of channels)."""
+    """Draw a row a scene: ray tracer, table, table with shadows, signed errors."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -187,7 +187,7 @@ class SceneError:
 
     @property
     def box(self) -> tuple[slice, slice]:
-        """Rows and columns of the contact's bounding box with ``BOX_MARGIN`` on each side; the whole image if nothing touches."""
+        """Rows and columns of the contact's box with ``BOX_MARGIN`` around it, or of the image."""
         return contact_box(self.contact, round(BOX_MARGIN * self.contact.shape[1]))
 
     @property
@@ -210,7 +210,7 @@ class SceneError:
 def table_errors(
     sensor: SensorSpec, surfaces: Mapping[str, GelSurface], table: PolyTable, tracer: Tracer
 ) -> dict[str, dict[str, SceneError]]:
-    """Errors of ``taxim`` and ``taxim_shadow`` (if the table has shadows) against the images of ``tracer`` by scene.
+    """Errors of ``taxim`` and ``taxim_shadow`` against the images of ``tracer``, by scene.
 
     ``surfaces`` (B = 1 each) share one grid, that of the first image of ``tracer`` if it has rendered already.
     """

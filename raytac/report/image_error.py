@@ -1,4 +1,6 @@
-"""Error of an 8-bit image against a reference: MAE, RMSE, PSNR, SSIM and FLIP, over the frame or a part of it.
+"""Error of an 8-bit image against a reference: MAE, RMSE, PSNR, SSIM and FLIP.
+
+Over the frame or a part of it.
 
 Images are RGB as the camera writes them: (H, W, 3), uint8, the gamma of the sensor's response in them. docs/comparison.md defines every
 figure once more in words.
@@ -36,12 +38,12 @@ def mae(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def psnr(rmse_levels: float) -> float:
-    """PSNR = 20 log₁₀(255 / RMSE) [dB] of an 8-bit image from its RMSE [levels]; inf for equal images."""
+    """PSNR = 20 log₁₀(255 / RMSE) [dB] of an 8-bit image, RMSE in levels; inf if equal."""
     return float("inf") if rmse_levels == 0 else float(20 * np.log10(255 / rmse_levels))
 
 
 def ssim_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """SSIM at every pixel, mean of the three channels, (H, W) float64, NaN within ``SSIM_BORDER`` of the edge.
+    """SSIM at every pixel, mean of three channels, (H, W); NaN within ``SSIM_BORDER``.
 
     Wang et al. 2004, eq. 13: K₁ = 0.01, K₂ = 0.03, L = 255, Gaussian window, population covariance; computed by scikit-image.
 
@@ -78,7 +80,9 @@ def has_flip() -> bool:
 
 
 def flip_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """LDR-FLIP at every pixel, in [0, 1], (H, W) float32, at ``FLIP_PPD``; 8-bit values / 255 are read as sRGB.
+    """LDR-FLIP at every pixel, in [0, 1], (H, W) float32, at ``FLIP_PPD``.
+
+    8-bit values / 255 are read as sRGB.
 
     Raises:
         BackendError: ``flip-evaluator`` is not installed.
@@ -135,7 +139,9 @@ def regions(contact: np.ndarray, pixel_pitch: tuple[float, float], ring_width: f
 
 
 def error_maps(image: np.ndarray, reference: np.ndarray, *, flip: bool | None = None) -> dict[str, np.ndarray]:
-    """Maps (H, W) that every region's figures are means of: ``absolute`` and ``squared`` [levels], ``ssim`` and ``flip``.
+    """Maps (H, W): ``absolute`` and ``squared`` [levels], ``ssim`` and ``flip``.
+
+    Every region's figures are means of them.
 
     ``flip``: None is with FLIP if its package is there, True asks for it.
 
@@ -158,7 +164,7 @@ def error_maps(image: np.ndarray, reference: np.ndarray, *, flip: bool | None = 
 def image_errors(
     image: np.ndarray, reference: np.ndarray, masks: Mapping[str, np.ndarray], *, flip: bool | None = None
 ) -> dict[str, float]:
-    """``{"frame.mae": …, "contact.psnr": …}`` for each mask and each of ``METRICS``; a figure of an empty mask is NaN.
+    """``{"frame.mae": …, "contact.psnr": …}`` for each mask and metric; NaN of an empty mask.
 
     SSIM and FLIP look at a pixel's neighbourhood: their maps come from the whole images, and the mask only says where to average. SSIM
     leaves out pixels near the edge of the image, as ``ssim_map`` says. ``flip`` as for ``error_maps``.

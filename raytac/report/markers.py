@@ -1,4 +1,4 @@
-"""Calibration of a pad's marker motion: the fitted file, errors on held-out presses as table and figures, and metrics."""
+"""Calibration of a pad's marker motion: fitted file, errors on held-out presses, metrics."""
 
 from __future__ import annotations
 
@@ -66,7 +66,9 @@ class MotionReport:
 def run_calibrate_markers(
     sensor: SensorSpec, out: Path, *, level: str, quick: bool, device: str, seed: int, start: float, progress: bool = True
 ) -> list[Path]:
-    """Press the soft pad of a ``level``, fit, test on held-out presses, and write ``FILES`` to ``out``; returns the files written.
+    """Press the soft pad, fit, test on held-out presses, and write ``FILES`` to ``out``.
+
+    Returns the files written.
 
     Finished presses are kept in ``presses`` of ``out``, also if an error or an interrupt ends the run. A later run reuses them.
 
@@ -134,7 +136,7 @@ def press_all(
 def calibrate_markers(
     sensor: SensorSpec, fit: list[PressFrame], held_out: list[PressFrame], *, level: str, device: str = "auto"
 ) -> MotionReport:
-    """Fit to ``fit`` and test on ``held_out``: whole presses, in order, of the soft pad of a ``level``."""
+    """Fit to ``fit`` and test on ``held_out``: whole presses of the soft pad of a ``level``."""
     data = ProbeData.of(sensor, fit)
     motion = fit_motion(data, device=device)
     fitted = replace(sensor, marker_motion=motion)
@@ -259,7 +261,9 @@ def draw_arrows(
     colour: str = "#1b1b1b",
     image: np.ndarray | None = None,
 ) -> float:
-    """Draw displacements in the image as arrows from the markers' positions at rest, environment 0; returns their magnification.
+    """Draw displacements as arrows from the markers at rest; returns their magnification.
+
+    Environment 0.
 
     ``magnified``: factor on the arrows; None picks 1, 2, 5, 10 … so that the longest is about as long as the spacing of the markers.
     ``image``: shown underneath, (H, W, 3) uint8.
@@ -291,7 +295,7 @@ def draw_arrows(
 
 
 def _magnification(rest: np.ndarray, displacement: np.ndarray) -> float:
-    """Magnification of 1, 2, 5, 10 … at which the longest arrow is at most ``_LONGEST`` spacings of neighbouring markers."""
+    """Magnification of 1, 2, 5, 10 … for arrows of at most ``_LONGEST`` marker spacings."""
     longest = float(np.linalg.norm(displacement, axis=1).max(initial=0.0))
     apart = np.linalg.norm(rest[:, None] - rest[None], axis=-1)
     spacing = float(np.median(np.where(apart > 0, apart, np.inf).min(axis=1)))
@@ -301,7 +305,10 @@ def _magnification(rest: np.ndarray, displacement: np.ndarray) -> float:
 
 
 def write_arrows(path: Path, sensor: SensorSpec, frames: list[PressFrame], *, device: str = "auto") -> None:
-    """Draw markers at the end of held-out presses, a row a load and a column a model; ``sensor`` has the marker motion."""
+    """Draw markers at the end of held-out presses, a row a load and a column a model.
+
+    ``sensor`` has the marker motion.
+    """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -347,7 +354,7 @@ def _outline(axes: Axes, tracker: MarkerTracker, frame: PressFrame) -> None:
 
 
 def write_errors(path: Path, report: MotionReport) -> None:
-    """Draw mean error and 95th percentile of every model by kind of load, beside the size of the motion itself."""
+    """Draw mean error and 95th percentile of every model by load, beside the motion's size."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 

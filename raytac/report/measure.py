@@ -42,7 +42,7 @@ def once(call: Callable[[Any], object], value: Any) -> float:
 
 
 def timed(call: Callable[[Any], object], inputs: Sequence[Any], frames: int) -> np.ndarray:
-    """Milliseconds of ``frames`` warm calls with ``inputs`` in turn; each input is called once before, to warm up."""
+    """Milliseconds of ``frames`` warm calls with ``inputs`` in turn, each called once before."""
     for value in inputs:
         call(value)
     return np.array([once(call, inputs[k % len(inputs)]) for k in range(frames)])
@@ -62,7 +62,7 @@ def timed_within(call: Callable[[Any], object], inputs: Sequence[Any], frames: i
 
 
 def machine() -> dict[str, Metric]:
-    """CPU, cores, load and GPU as far as the system tells: keys ``machine.cpu``, ``.cores``, ``.load_at_start``, ``.gpu``."""
+    """Metrics of the machine: ``machine.cpu``, ``.cores``, ``.load_at_start``, ``.gpu``."""
     cpu = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.is_file():

@@ -72,7 +72,7 @@ def run_press(
 
 
 def exr_channels(frame: TactileFrame, outputs: tuple[str, ...], env: int = 0) -> dict[str, np.ndarray]:
-    """Channels of ``frame.exr`` for one environment, each (H, W) float32; empty if ``outputs`` name no image.
+    """Channels of ``frame.exr`` for one environment, each (H, W) float32; empty without images.
 
     ``R G B``: linear image, the sum of the layers; ``led_<layer>.R`` …: each layer; ``N.X`` …: normal; ``P.X`` …: position [m];
     ``Z``: camera-axis depth [m].
@@ -207,7 +207,7 @@ def _write_preview(
 def press_peaks(
     sensor: str | Path | SensorSpec, scenes: Sequence[str | Path], size: tuple[int, int], seed: int = 0
 ) -> tuple[SensorSpec, dict[str, GelSurface]]:
-    """The sensor's specification, and the surface (B = 1) at the peak of each press scene by its name.
+    """The sensor's specification, and the surface (B = 1) at the peak of scenes by name.
 
     The grid's pitch is that of a pixel of ``size`` (width, height) on the pad, at most 0.1 mm.
 

@@ -1,4 +1,4 @@
-"""Finished presses of the soft pad, kept on disk so that an interrupted calibration goes on where it stopped."""
+"""Finished presses of the soft pad on disk, so that an interrupted calibration goes on."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ _CODE = ("ipc", "raytac.physics")
 
 
 class PressStore:
-    """One ``.npz`` a press in ``folder``, under a digest of all that shapes it: gelpad, press, level, device, code and versions."""
+    """One ``.npz`` a press in ``folder``, under a digest of all that shapes it.
+
+    That is gelpad, press, level, device, code and versions.
+    """
 
     def __init__(
         self, folder: Path, gelpad: GelpadSpec, *, pad: str, device: str, code: str, say: Callable[[str], object] = print
@@ -50,7 +53,7 @@ class PressStore:
         return states
 
     def write(self, press: Press, states: PressStates) -> None:
-        """Keep the states of a press, with a digest, so that neither half of a file nor a damaged one looks finished."""
+        """Keep the states of a press, with a digest, so that damage is seen."""
         mesh = states.coat.mesh
         arrays = {name: getattr(mesh, name) for name in ("rest", "faces", "lines_x", "lines_y")}
         arrays |= {"loads": np.array(states.loads), "poses": states.poses, "positions": states.coat.positions}
@@ -61,7 +64,7 @@ class PressStore:
 
 
 def press_code() -> str:
-    """Digest of the source code that a press depends on: the presses' own, and all of the solver and of physics."""
+    """Digest of the source code that a press depends on: its own, solver and physics."""
     return code_digest("raytac.markers.calibration_presses", *_modules())
 
 

@@ -87,7 +87,10 @@ def camera_extent_mm(camera: CameraSpec) -> tuple[float, float, float, float]:
 
 
 def difference_to_rest(rgb: np.ndarray, rest_rgb: np.ndarray, full_scale: float = DIFFERENCE_RANGE) -> np.ndarray:
-    """Signed difference of two 8-bit images with grey for none: 0.5 + (rgb − rest) / (2 · full_scale), clipped to [0, 1]."""
+    """Signed difference of two 8-bit images with grey for none, in [0, 1].
+
+    0.5 + (rgb − rest) / (2 · full_scale), clipped.
+    """
     return np.clip(0.5 + (rgb.astype(np.float32) - rest_rgb.astype(np.float32)) / (2.0 * full_scale), 0.0, 1.0)
 
 
@@ -97,7 +100,7 @@ def write_preview(path: Path, data: PreviewData, sensor: SensorSpec, *, dpi: int
 
 
 def draw_preview(data: PreviewData, sensor: SensorSpec) -> Figure:
-    """A figure 7.16 inches wide (two columns of a paper), three panels a row; maps in mm at one scale.
+    """A figure 7.16 inches wide (two columns), three panels a row; maps in mm at one scale.
 
     The section begins the last row and is as wide as leaves no place empty, one to three panels.
     """
@@ -121,7 +124,7 @@ def draw_preview(data: PreviewData, sensor: SensorSpec) -> Figure:
 
 
 def _lay_out(panels: list[tuple[_Panel, int]], rows: int, data: PreviewData) -> Figure:
-    """Place the panels, each with its width in columns, by hand, so that they line up whatever their labels are."""
+    """Place the panels by hand, with widths in columns, so that they line up with any labels."""
     x_low, x_high, bottom, top = data.extent_mm
     wide = 1.62  # leaves room for a colour bar's figures at the right edge
     high = wide * float(np.clip((bottom - top) / (x_high - x_low), 0.5, 1.3))
@@ -158,7 +161,7 @@ def _grid_extent_mm(grid: PadGrid) -> tuple[float, float, float, float]:
 
 
 def _hillshade(height: np.ndarray, pitch: tuple[float, float]) -> np.ndarray:
-    """Lambert shading of a height map seen from −z, lit from the upper left; shape as ``height``, in [0, 1]."""
+    """Lambert shading in [0, 1] of a height map seen from −z, lit from the upper left."""
     zy, zx = np.gradient(height, pitch[1], pitch[0])
     normal = np.stack([zx, zy, -np.ones_like(zx)], axis=-1) / np.sqrt(1.0 + zx**2 + zy**2)[..., None]
     light = np.array([-0.5, -0.6, -1.0]) / np.linalg.norm([0.5, 0.6, 1.0])
@@ -274,7 +277,7 @@ def _difference_panel(axes: Axes, data: PreviewData) -> None:
 
 
 def _section_point(data: PreviewData) -> tuple[int, float]:
-    """Grid row of the cross-section and its y [mm]: through ``section``, else through the deepest point."""
+    """Grid row of the cross-section and its y [mm]: ``section``, else the deepest point."""
     indentation = data.grid.rest - data.height
     if data.section is not None and np.isfinite(data.section).all():
         row = int(np.argmin(np.abs(data.grid.y - data.section[1])))

@@ -1,4 +1,4 @@
-"""``raytac compare-real``: every optical mode against real photographs of presses that it was not fitted to."""
+"""``raytac compare-real``: optical modes against photographs of other presses."""
 
 from __future__ import annotations
 
@@ -108,7 +108,9 @@ class RealSettings:
 def compare_real(
     sensor: SensorSpec, presses: RealPresses, shots: Photographs, out: Path, settings: RealSettings, *, began: float | None = None
 ) -> list[Path]:
-    """Fit, test and write ``real.md``, ``real.png`` and ``metrics.json`` to ``out``; ``shots`` are the fully visible ``presses``.
+    """Fit, test and write ``real.md``, ``real.png`` and ``metrics.json`` to ``out``.
+
+    ``shots`` are the fully visible ``presses``.
 
     Raises:
         InputError: a split that leaves too few presses, or a folder that cannot be written.
@@ -221,7 +223,7 @@ def _fitted(
 
 
 def _tested(models: Models, sensor: SensorSpec, shots: Photographs) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Images of every mode and of the background alone at refined circles, and at the labelled ones."""
+    """Images of every mode and of the background at refined circles and at labelled ones."""
     refined, slopes = models.circles(shots), models.fitted.state.slopes
     nothing = np.broadcast_to(shots.background, shots.presses.shape)
     scores = []
@@ -314,7 +316,7 @@ BOX_MARGIN = 15
 
 
 def press_scores(sensor: SensorSpec, images: np.ndarray, shots: Photographs) -> list[dict[str, float]]:
-    """Errors of ``images`` (N, H, W, 3) [levels] against the photographs, by press and labelled circle.
+    """Errors of ``images`` (N, H, W, 3) [levels] by press, at labelled circles.
 
     MAE and RMSE [levels] in the disc, MAE in the ring from one to two radii, PSNR [dB] and SSIM in the box of the circle and
     ``BOX_MARGIN`` px, MAE over the frame. SSIM is left out where scikit-image is not installed.
@@ -350,6 +352,6 @@ def summary(scores: list[dict[str, float]]) -> dict[str, float]:
 
 
 def noise_floor(sensor: SensorSpec, shots: Photographs) -> float:
-    """Mean absolute difference [levels] of the photographs from the background, more than ``FAR`` radii from the contact."""
+    """Mean absolute difference [levels] of photographs from the background, beyond ``FAR``."""
     far = shots.distance(sensor) > FAR
     return float(np.abs(shots.presses - shots.background)[far].mean())

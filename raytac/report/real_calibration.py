@@ -1,4 +1,4 @@
-"""``raytac calibrate DATASET``: one optical mode fitted to real presses, its errors on others, and its files."""
+"""``raytac calibrate DATASET``: fit one optical mode to real presses, with errors on others."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def run_calibrate_optics(
     start: float,
     shadow_table: str = SHADOW_TABLES[0],
 ) -> list[Path]:
-    """Fit ``model`` to all but every ``holdout``-th of ``shots`` and write it to the folder ``out``.
+    """Fit ``model`` to all but every ``holdout``-th of ``shots`` and write it to ``out``.
 
     An error leaves nothing there.
 

@@ -1,4 +1,7 @@
-"""Optical modes of one sensor, each built once: a ray tracer fits the case's light and compiles kernels, which takes seconds."""
+"""Optical modes of one sensor, each built once.
+
+A ray tracer fits the case's light and compiles kernels, which takes seconds.
+"""
 
 from __future__ import annotations
 
@@ -53,5 +56,5 @@ class Tracers:
 
 
 def path_trace(tracer: Tracer, surface: GelSurface, spp: int, seed: int) -> np.ndarray:
-    """Linear radiance (H, W, 3) of environment 0 from a path tracer of ``Tracers``, with vertex update and BVH rebuild."""
+    """Linear radiance (H, W, 3) of environment 0 by path tracing, BVH rebuild included."""
     return tracer.render_layers(surface, spp=spp, seed=seed)["all"][0]

@@ -1,4 +1,7 @@
-"""``TactileSensor``: one sensor, one physics, one optical mode; a press or a surface goes in, a ``TactileFrame`` comes out."""
+"""``TactileSensor``: one sensor, one physics, one optical mode.
+
+A press or a surface goes in, a ``TactileFrame`` comes out.
+"""
 
 from __future__ import annotations
 
@@ -151,7 +154,7 @@ class TactileSensor:
 
     @property
     def label(self) -> str:
-        """Physics of the press that was loaded last and optics, e.g. ``rigid+raytrace-fast``; goes into headers and reports.
+        """Physics of the last press and optics, e.g. ``rigid+raytrace-fast``, for headers.
 
         The optical mode names itself once it is built: a table casts shadows only if it has some.
         """
@@ -159,12 +162,18 @@ class TactileSensor:
 
     @property
     def sampling(self) -> dict[str, int | float | str]:
-        """``integrator``, ``spp`` and ``exposure`` of the optical mode, for headers and reports; empty without images or rays."""
+        """``integrator``, ``spp`` and ``exposure`` of the optical mode, for headers and reports.
+
+        Empty without images or rays.
+        """
         return getattr(self.optical_mode, "sampling", {}) if self._optical_outputs else {}
 
     @property
     def device_used(self) -> str:
-        """``cpu`` or ``cuda``: where the images are made; without images where a soft pad is solved, and ``cpu`` for a rigid one."""
+        """``cpu`` or ``cuda``: where images are made.
+
+        Without images where a soft pad is solved, and ``cpu`` for a rigid one.
+        """
         if self._optical_outputs:
             return self.optical_mode.device
         return resolve_device(self.device, ray_tracing=False) if self._used.is_simulated else "cpu"
@@ -183,7 +192,9 @@ class TactileSensor:
         progress: bool = False,
         **own: Any,
     ) -> TactileFrame:
-        """Run the scene's trajectory and return the frame at its peak (the end of the last stage that is not a release).
+        """Run the scene's trajectory and return the frame at its peak.
+
+        That is the end of the last stage that is not a release.
 
         A mesh file or an array of heights [m] is pressed in to ``depth`` [m]; ``scale`` [m per file unit] and ``pitch`` [m] as in
         ``raytac.specs.press_of``.
@@ -215,7 +226,9 @@ class TactileSensor:
         twists: np.ndarray | None = None,
         seeds: Sequence[int] | None = None,
     ) -> Pad:
-        """Put the scene's object before this sensor, and return the physics, so that a loop can step it and call ``update``.
+        """Put the scene's object before this sensor, and return the physics.
+
+        A loop can step it and call ``update``.
 
         Args:
             scene: name of a shipped press scene, path of a scene file, or a scene.
@@ -256,7 +269,7 @@ class TactileSensor:
         return self._pad
 
     def update(self, state: PadReading | GelSurface, envs: Sequence[int] | None = None) -> TactileFrame:
-        """Frame of what a pad reads, in a press that ``load`` set up or in a world, or of a bare gel surface.
+        """Frame of a pad's reading, in a press of ``load`` or in a world, or of a gel surface.
 
         With markers, call it for every reading in order: some models follow the object since first touch (``reset_markers`` forgets).
 
@@ -314,7 +327,9 @@ class TactileSensor:
         return outputs
 
     def _check_width(self, state: PadReading, cells: np.ndarray) -> None:
-        """Warn once a press, where a stage ends, of a contact at a given depth that the pad's cells cannot resolve.
+        """Warn once a press of a contact that the pad's cells cannot resolve.
+
+        Only where a stage to a depth ends.
 
         On the way every contact is narrow once, so what lies between the ends of stages is not looked at.
         """
@@ -337,7 +352,7 @@ class TactileSensor:
         return TactileFrame(surface, time_ms=time_ms, label=self.label, **fields)  # a mode is named once it is built
 
     def rest(self, envs: Sequence[int] = (0,)) -> TactileFrame:
-        """Frame of untouched pads, what every difference image is taken from; markers keep their history.
+        """Frame of untouched pads, which difference images start from; markers keep history.
 
         ``envs``: as in which environments the markers are placed, one row each; all are alike but for a pattern that is shifted or turned.
         """
@@ -373,7 +388,9 @@ class TactileSensor:
         return self._tracker
 
     def reset_markers(self, envs: np.ndarray | list[int] | None = None) -> None:
-        """Forget what the markers of environments (a mask (B,), a list, or None for all) went through; draws their placement again.
+        """Forget the history of the markers of environments, and draw their placement again.
+
+        ``envs``: a mask (B,), a list, or None for all.
 
         ``load`` and ``press`` do it for all.
 

@@ -9,7 +9,9 @@ _SPACING = 0.03e-3
 
 
 def coin_elevation(radius: float, height: float) -> np.ndarray:
-    """Elevation [m] of the coin's face, shape (N, N), over the square |x|, |y| <= ``radius`` [m], from 0 (field) to ``height``.
+    """Elevation [m] of the coin's face (N, N), from 0 (field) to ``height``.
+
+    Over the square of half edge ``radius`` [m].
 
     Rows run along y, columns along x, seen through the coin from its back, so that the face-down coin reads the right way in the
     camera's image (x right, y down). Flanks rise smoothly over 0.035 radius.

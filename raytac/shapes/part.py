@@ -52,7 +52,7 @@ class Part:
 
 
 def primitive(kind: str, size: tuple[float, ...] = (), object_from_part: np.ndarray | None = None) -> Part:
-    """A part without arrays; raises ``InputError`` for an unknown kind or a size that is not positive and finite."""
+    """A part without arrays; ``InputError`` for an unknown kind or a size that cannot be."""
     if not isinstance(kind, str) or kind not in _SIZES:
         raise InputError("kind", value=kind, rule="must be a primitive (mesh: mesh_part, hfield: hfield_part)", choices=_SIZES)
     given, size = size, tuple(check_numbers("size", size, (None,))[: _SIZES[kind]].tolist())
@@ -74,7 +74,10 @@ def primitive(kind: str, size: tuple[float, ...] = (), object_from_part: np.ndar
 
 
 def mesh_part(vertices: np.ndarray, faces: np.ndarray, object_from_part: np.ndarray | None = None) -> Part:
-    """A triangle mesh; a watertight one that is inside out is turned. Raises ``InputError`` for bad arrays."""
+    """A triangle mesh; a watertight one that is inside out is turned.
+
+    Raises ``InputError`` for bad arrays.
+    """
     vertices = check_numbers("vertices", vertices, (None, 3))
     faces = check_numbers("faces", faces, (None, 3), finite=True).astype(np.int64)
     far = ~(np.abs(vertices) <= _LONGEST).all(axis=1)

@@ -22,7 +22,9 @@ _ROOT_STEPS = 100
 
 
 def line_in_part(pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Vertical lines in the part frame: the three coordinates of o, each (…, Ny, Nx), and of the common direction d, each (…, 1, 1).
+    """Vertical lines in the part frame: o as three (…, Ny, Nx), d as three (…, 1, 1).
+
+    Point o + t d; d is common to all lines.
 
     ``pose``: (…, 4, 4).
     """
@@ -31,7 +33,10 @@ def line_in_part(pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[list[n
 
 
 def bounds(kind: str, size: tuple[float, ...], pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Axis-aligned box (lower, upper), each (…, 3) [m], in the pad frame, that holds the primitive at poses (…, 4, 4)."""
+    """Axis-aligned box (lower, upper) [m] that holds the primitive at poses (…, 4, 4).
+
+    Each (…, 3), pad frame.
+    """
     rotation, centre = pose[..., :3, :3], pose[..., :3, 3]
     axis = rotation[..., :, 2]
     across = np.sqrt(np.clip(1.0 - axis**2, 0.0, None))

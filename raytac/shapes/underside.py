@@ -20,7 +20,9 @@ _NODES = 32768
 def object_height(
     parts: Sequence[Part], pad_from_object: np.ndarray, x: np.ndarray, y: np.ndarray, *, below: float = np.inf
 ) -> np.ndarray:
-    """Lowest z [m] of the object above each node, pad frame, shape (B, Ny, Nx), float64; ``inf`` where nothing is above.
+    """Lowest z [m] of the object above each node, pad frame, (B, Ny, Nx), float64.
+
+    ``inf`` where nothing is above.
 
     ``pad_from_object``: poses (B, 4, 4). ``x`` (Nx,), ``y`` (Ny,) [m]: evenly spaced, ascending; (B, Nx), (B, Ny) where every
     environment has its own. The object is the union of its ``parts``: the minimum of their undersides (exact for primitives, exact linear
@@ -46,7 +48,7 @@ def object_height(
 
 
 def object_bounds(parts: Sequence[Part], pad_from_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Axis-aligned box (lower, upper), each (3,) [m], in the pad frame, that holds the object at one pose (4, 4)."""
+    """Axis-aligned box (lower, upper) [m], each (3,), that holds the object at one pose."""
     boxes = [_part_bounds(part, pad_from_object @ part.object_from_part) for part in parts]
     return np.min([low for low, _ in boxes], axis=0), np.max([high for _, high in boxes], axis=0)
 

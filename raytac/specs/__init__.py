@@ -1,4 +1,4 @@
-"""Sensors, lights and press scenes as data: dataclasses in SI units, and the only readers of TOML in the package."""
+"""Sensors, lights and press scenes as dataclasses in SI units; the only readers of TOML."""
 
 import lazy_loader
 

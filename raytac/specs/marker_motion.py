@@ -1,4 +1,7 @@
-"""Motion of a pad's markers under a load, fitted by ``raytac calibrate markers``: files of ``scenes/markers/``."""
+"""Motion of a pad's markers under a load, as in ``scenes/markers/``.
+
+``raytac calibrate markers`` fits it.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from raytac.specs.toml import Number, Schema, Text, check_fields, read_toml, spl
 
 @dataclass(frozen=True)
 class PunchSpec:
-    """Motion of the skin around a contact that sticks: the rigid punch of contact mechanics (docs/markers.md)."""
+    """Motion of the skin around a contact that sticks: a rigid punch (docs/markers.md)."""
 
     anisotropy: float
     """κ: how much farther the skin follows along the shear than across it [-]; ν / (2 − ν) on a half-space, 0 alike."""
@@ -24,7 +27,7 @@ class PunchSpec:
 
 @dataclass(frozen=True)
 class MarkerMotionSpec:
-    """Constants of the fitted marker models of one gelpad; they do not depend on the pattern of dots."""
+    """Constants of the fitted marker models of one gelpad, whatever its pattern of dots."""
 
     dilate_gain: float
     """Gain of FOTS' dilation, taken as an integral over the contact [1/m³]."""
@@ -85,7 +88,9 @@ MARKER_MOTION_SCHEMA: Final[dict[str, Schema]] = {
 
 
 def load_marker_motion(name_or_path: str | Path, *, base: Path | None = None) -> MarkerMotionSpec:
-    """Read and check a file of ``scenes/markers/``: a shipped name such as ``"gelsight_mini"`` or a path, relative to ``base`` if given.
+    """Read and check a file of ``scenes/markers/``.
+
+    A shipped name such as ``"gelsight_mini"``, or a path, relative to ``base`` if given.
 
     Raises:
         SpecError: unknown name, unreadable file, unknown or missing key, wrong type, value out of range.

@@ -103,7 +103,10 @@ class ObjectSpec:
 
 @dataclass(frozen=True)
 class StageSpec:
-    """One leg of the trajectory; targets are absolute, measured from first touch at zero shear and twist."""
+    """One stage of the trajectory.
+
+    Targets are absolute, measured from first touch at zero shear and twist.
+    """
 
     kind: str
     """``indent shear twist release``."""
@@ -152,6 +155,6 @@ class PressScene:
 
     @property
     def peak_stage(self) -> int:
-        """Index of the stage whose end is imaged: the last one that is not a release; −1 if there is none."""
+        """Index of the stage whose end is imaged: the last that is not a release; −1 for none."""
         kinds = [s.kind for s in self.trajectory]
         return max((i for i, k in enumerate(kinds) if k != "release"), default=-1)

@@ -1,4 +1,4 @@
-"""Press scenes from TOML, ``scenes/press/*.toml``, from meshes and from height maps; rules between scene and sensor."""
+"""Press scenes from TOML, meshes and height maps; rules between scene and sensor."""
 
 from __future__ import annotations
 

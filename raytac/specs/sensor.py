@@ -127,7 +127,7 @@ class GelpadSpec:
         check_fields(vars(self), SENSOR_SCHEMA["gelpad"], "gelpad")
 
     def sag(self, x: Any, y: Any) -> Any:
-        """Depth [m] of the surface at rest below the pad centre at ``x``, ``y`` [m], within the radii; numbers or arrays.
+        """Depth [m] of the surface at rest below the pad centre at ``x``, ``y`` [m] in the radii.
 
         s(x; Rx) + s(y; Ry) with the sagitta s(u; R) = R − √(R² − u²) = u² / (R + √(R² − u²)): a circular arc of radius Rx
         carried along one of radius Ry.
@@ -139,7 +139,7 @@ class GelpadSpec:
 
 @dataclass(frozen=True)
 class CoatSpec:
-    """The pigmented skin that the camera sees: a diffuse base blended with a rough (GGX) specular lobe."""
+    """Pigmented skin that the camera sees: a diffuse base and a rough (GGX) specular lobe."""
 
     reflectance: Vec3
     """Diffuse albedo per camera channel (linear R, G, B), each in [0, 1]."""
@@ -169,7 +169,7 @@ class CaseSpec:
 
 @dataclass(frozen=True)
 class CameraSpec:
-    """A pinhole looking along +z, given by what is measured with a ruler: the pixel pitch on the gel plane z = 0."""
+    """A pinhole looking along +z, given by the pixel pitch on the gel plane z = 0."""
 
     resolution: tuple[int, int]
     """Native (width, height) [px] of the image that the specification describes."""
@@ -184,14 +184,17 @@ class CameraSpec:
         check_fields(vars(self), SENSOR_SCHEMA["camera"], "camera")
 
     def pitch_at(self, resolution: tuple[int, int]) -> Vec2:
-        """Size along x and y [m] of a pixel on the plane z = 0 where the whole image has ``resolution`` (width, height) [px]."""
+        """Size along x and y [m] of a pixel on z = 0 at a ``resolution`` (width, height) [px]."""
         (px, py), (nx, ny), (width, height) = self.pixel_pitch, self.resolution, resolution
         return px * nx / width, py * ny / height
 
 
 @dataclass(frozen=True)
 class ResponseSpec:
-    """From linear radiance to the 8-bit value: u8 = 255 · clip(wb · exposure · vignette · shading · L + black)^(1/γ)."""
+    """From linear radiance L to an 8-bit value.
+
+    u8 = 255 · clip(wb · exposure · vignette · shading · L + black)^(1/γ).
+    """
 
     exposure: float | Literal["auto"]
     """Common gain from radiance [W/(m² sr), relative] to full scale 1; ``AUTO`` is the one that makes the image at rest mid-grey
@@ -268,7 +271,9 @@ class MarkerSpec:
 
 @dataclass(frozen=True)
 class RefractionSpec:
-    """Planar layers between the air around camera and LEDs and the coat; ``model`` is ``"none"`` or ``"slab"``.
+    """Planar layers between the coat and the air around camera and LEDs.
+
+    ``model`` is ``"none"`` or ``"slab"``.
 
     ``"slab"``: the gel and its support plate, index-matched, with a flat air interface at z = −(thickness + plate).
     """
@@ -296,7 +301,7 @@ class OpticsSpec:
 
 @dataclass(frozen=True)
 class LedSpec:
-    """One LED: a rectangle that emits from its front side with radiance ∝ cos^(n−1) θ, i.e. intensity ∝ cosⁿ θ."""
+    """One LED: a rectangle that emits from its front side with radiance ∝ cos^(n−1) θ."""
 
     name: str
     layer: str
@@ -322,7 +327,7 @@ class LedSpec:
 
     @property
     def edges(self) -> tuple[Vec3, Vec3]:
-        """Unit directions u, v of the rectangle's edges, pad frame: u along z × axis, v = axis × u; (u, v, axis) right-handed."""
+        """Unit vectors u along z × axis and v = axis × u of the edges, pad frame; right-handed."""
         ax, ay, az = self.axis
         flat = math.hypot(ax, ay)
         ux, uy = (-ay / flat, ax / flat) if flat > 1e-9 else (1.0, 0.0)
@@ -360,7 +365,7 @@ SENSOR_PARTS: Final = {
 
 @dataclass(frozen=True)
 class SensorSpec:
-    """A sensor; each part checks its own ranges when it is made, ``validate_sensor`` what the parts are to each other.
+    """A sensor: parts check their own ranges, ``validate_sensor`` checks them together.
 
     The latter is done for a file and for every sensor that is used, not here, so that a fit may move lights through each other.
     """

@@ -1,4 +1,4 @@
-"""Rules that need more than one value of a sensor: what must fit, see, or stay clear of what."""
+"""Rules that need more than one value of a sensor."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ _SLACK = 1e-9
 
 
 def validate_sensor(sensor: SensorSpec) -> None:
-    """Check a sensor as a whole; done for files and for every specification that a ``TactileSensor`` or world is made of.
+    """Check a sensor as a whole.
+
+    Files and every specification of a ``TactileSensor`` or a world go through it.
 
     Raises:
         SpecError: the dome is deeper than the pad; the camera lies in the gel, outside the case, or sees past the pad; the

@@ -47,7 +47,10 @@ def load_sensor(name_or_path: str | Path) -> SensorSpec:
 
 
 def sensor_spec(sensor: str | Path | SensorSpec) -> SensorSpec:
-    """The specification itself, or that of a name or file; raises ``InputError`` or ``SpecError``."""
+    """The specification itself, or that of a name or file.
+
+    Raises ``InputError`` or ``SpecError``.
+    """
     if not isinstance(sensor, (str, Path, SensorSpec)):
         raise InputError("sensor", value=sensor, rule=f"must be a name, a path or a SensorSpec, not {type(sensor).__name__}")
     if not isinstance(sensor, SensorSpec):
@@ -85,7 +88,7 @@ def _read_sensor(path: Path, above: tuple[Path, ...] = ()) -> SensorSpec:
 
 
 def load_lights(name_or_path: str | Path) -> LightsSpec:
-    """Read and check the lights of a sensor: a shipped name such as ``"gelsight_mini"`` or the path of a TOML file.
+    """Read and check the lights of a sensor: a shipped name or the path of a TOML file.
 
     Whether each LED lies inside the case and outside the gel needs the sensor: ``load_sensor`` and ``validate_sensor`` check it.
 
@@ -135,7 +138,10 @@ def _read_led(table: Table) -> LedSpec:
 
 
 def lights_text(lights: LightsSpec, comment: str) -> str:
-    """A light file: ``comment``, its lines marked with #, then one table an LED. Millimetres to 10 µm, powers to four digits."""
+    """A light file: ``comment``, its lines marked with #, then one table an LED.
+
+    Millimetres to 10 µm, powers to four digits.
+    """
 
     def row(values: tuple[float, ...], scale: float, digits: str) -> str:
         return ", ".join(f"{scale * value:{digits}}" for value in values)
@@ -150,7 +156,10 @@ def lights_text(lights: LightsSpec, comment: str) -> str:
 
 
 def response_text(response: ResponseSpec) -> str:
-    """The table ``[response]`` to six digits, colour shading to four decimals with one line for each order in x."""
+    """The table ``[response]`` to six digits, colour shading to four decimals.
+
+    Shading has one line for each order in x.
+    """
 
     def row(values: tuple[float, ...]) -> str:
         return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"

@@ -1,4 +1,4 @@
-"""Shapes as press and task scenes write them: the keys of every kind, and the rules between lengths, meshes and poses."""
+"""Shapes of press and task scenes: keys of every kind, rules of lengths, meshes and poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sweeps: objects, sensors, ranges of presses, their number, and the outputs that are kept. SI units, pad frame."""
+"""Sweeps: objects, sensors, ranges of presses and their number. SI units, pad frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Task scenes: a robot that carries sensors, bodies around it, and the steps in which they move. SI units, world frame.
+"""Task scenes: a robot that carries sensors, bodies around it, steps. SI, world frame.
 
 World frame: base of the arm, z up, x ahead.
 """

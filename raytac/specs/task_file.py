@@ -141,7 +141,7 @@ def _check_names(tables: tuple[Table, ...], bodies: tuple[BodySpec, ...]) -> Non
 
 
 def load_scene(name_or_path: str | Path) -> PressScene | TaskScene:
-    """Read and check a press scene or a task scene, by its shipped name or by the path of a file.
+    """Read and check a press scene or a task scene, by its name or by the path of a file.
 
     A file with ``[robot]`` is a task.
 

@@ -1,4 +1,4 @@
-"""A small validating reader: a schema of fields in, a dict of SI values out, one precise error otherwise.
+"""A small validating reader: a schema in, a dict of SI values or one precise error out.
 
 A schema maps a TOML key to a field. The key carries its unit as a suffix (``thickness_mm``); the value comes out in SI under
 the bare name (``thickness``), so that a section can be handed to its dataclass as keyword arguments. Ranges are written in the
@@ -50,7 +50,7 @@ rounds once, where multiplying by 0.001, itself rounded, makes 36 mm 0.036000000
 
 @dataclass(frozen=True)
 class Unit:
-    """The unit that a key carries: ``si = value * numerator / denominator``, and how it is written in messages."""
+    """Unit of a key: ``si = value * numerator / denominator``, and its name in messages."""
 
     numerator: float = 1.0
     denominator: float = 1.0
@@ -93,7 +93,7 @@ class _Refused(Exception):
 
 
 class _Field:
-    """One field of a table, which is one value or a list of ``length`` values (``ANY``: one or more)."""
+    """One field of a table: one value, or a list of ``length`` values (``ANY``: one or more)."""
 
     length: int = 0
     default: Any = REQUIRED
@@ -193,7 +193,9 @@ class Integer(Number):
 
 @dataclass(frozen=True)
 class Text(_Field):
-    """A non-empty string: one of ``choices``, or one that ``pattern`` matches as a whole (``described`` says it in words).
+    """A non-empty string: one of ``choices``, or one that ``pattern`` matches as a whole.
+
+    ``described`` says the pattern in words.
 
     With ``length`` = ``ANY``, a list of one or more of them, none twice.
     """

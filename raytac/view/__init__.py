@@ -1,4 +1,7 @@
-"""A scene in the browser: 3-D view, tactile images, sliders; ``raytac view SCENE`` (see docs/viewer.md). Needs ``raytac[view]``."""
+"""A scene in the browser: ``raytac view SCENE`` (docs/viewer.md). Needs ``raytac[view]``.
+
+The page has a 3-D view, tactile images and sliders.
+"""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The page around the 3-D view: it forwards what users do, and draws what the player reports."""
+"""The page around the 3-D view: it forwards users' actions and draws the player's reports."""
 
 from __future__ import annotations
 
@@ -34,7 +34,10 @@ _AXES = ("x", "y", "z")
 
 
 class Page:
-    """Everything that is seen in the browser; shared by all clients. ``show`` is for the player, the rest reacts to users."""
+    """All that is seen in the browser; clients share it.
+
+    ``show`` is for the player, the rest reacts to users.
+    """
 
     def __init__(self, server: ViserServer, session: Session) -> None:
         """Build the page; it stays still until ``attach`` ties it to a player."""

@@ -1,4 +1,4 @@
-"""A press scene as a session: its trajectory to play, and sliders that press, shear and twist the object."""
+"""A press scene as a session: its trajectory, and sliders to press, shear and twist."""
 
 from __future__ import annotations
 
@@ -47,7 +47,10 @@ _OBJECT_COLOUR = (150, 156, 166)
 
 
 class PressSession:
-    """One sensor and the object of a press scene (see ``Session``); the world frame is the pad frame."""
+    """One sensor and the object of a press scene (see ``Session``).
+
+    The world frame is the pad frame.
+    """
 
     units_per_metre = 100.0
     is_driven_at_rest = True

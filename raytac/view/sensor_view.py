@@ -1,4 +1,4 @@
-"""Drawing of a sensor: gel block, case, lights and camera once, coat and image at every state."""
+"""Drawing of a sensor: gel block, case, lights and camera; coat and image by state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""viser's server behind a guard: other pages are refused, and messages checked before viser sees them."""
+"""viser's server behind a guard, which refuses other pages and checks messages."""
 
 from __future__ import annotations
 

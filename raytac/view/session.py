@@ -41,7 +41,10 @@ QUANTITIES = {
 
 @dataclass(frozen=True)
 class Control:
-    """A number that a slider sets. ``low``, ``high``, ``step`` and the values handed over are in the unit of the label."""
+    """A number that a slider sets.
+
+    ``low``, ``high``, ``step`` and the values handed over are in the unit of the label.
+    """
 
     name: str
     label: str
@@ -87,7 +90,10 @@ def round_up(value: float) -> float:
 
 @dataclass(frozen=True)
 class Solid:
-    """A triangle mesh: made once, then placed by ``Snapshot.poses`` or reshaped by ``Snapshot.reshaped``."""
+    """A triangle mesh, made once.
+
+    ``Snapshot.poses`` places it, or ``Snapshot.reshaped`` deforms it.
+    """
 
     name: str
     """Unique among solids; slashes make a tree."""
@@ -171,7 +177,10 @@ class CameraPlace:
 
 
 class Session(Protocol):
-    """Something that can be played, stepped, driven and drawn. Every method is called by one thread only, one at a time."""
+    """Something that can be played, stepped, driven and drawn.
+
+    One thread alone calls its methods, one at a time.
+    """
 
     title: str
     """One line: scene, sensor, physics and optics."""

@@ -1,4 +1,4 @@
-"""``Viewer``: a web server, its page and the thread that runs the session, from start to a clean end."""
+"""``Viewer``: a web server, its page and the session's thread, from start to end."""
 
 from __future__ import annotations
 

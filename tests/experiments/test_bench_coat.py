@@ -18,6 +18,7 @@ def test_the_shown_coat_is_nearer_than_the_mesh(tmp_path):
     assert found["edge.coarse.force_n"] > found["edge.truth_force_n"] > 2.0
 
 
+@pytest.mark.slow
 def test_markers_are_nearer_than_the_mesh(tmp_path):
     bench_coat.Args(out=tmp_path, levels="coarse", shapes="ball", cell_um=150.0).run()
     found = {key: float(value) for key, value in read_metrics(tmp_path / "metrics.json").items() if key.startswith("ball")}

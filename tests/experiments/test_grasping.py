@@ -24,7 +24,16 @@ def test_lift_holds_a_cube_with_both_pads(tmp_path):
         assert (tmp_path / "lift" / name).stat().st_size > 1000
 
 
-def test_a_grasp_without_friction_enough_slips(tmp_path):
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures and films take longer than what they show; those of the first grasp are looked at."""
+    for name in ("plot", "draw_strip", "film"):
+        for script in (lift, twist):
+            if hasattr(script, name):
+                monkeypatch.setattr(script, name, lambda *args: None)
+
+
+def test_a_grasp_without_friction_enough_slips(tmp_path, undrawn):
     """2 μ N = 0.4 N at most against a weight of 0.49 N: the fingers go up and the cube stays."""
     lift.main(lift.Args(out=tmp_path / "lift", cases=("cube:0.05",), physics=("ipc",), quick=True, device="cpu"))
     found = read_metrics(tmp_path / "lift" / "metrics.json")
@@ -41,12 +50,11 @@ def test_lift_names_what_it_does_not_know():
         lift.kind_of("cube:oil")
 
 
-def test_twist_keeps_everything_apart_and_upright(tmp_path):
+def test_twist_keeps_everything_apart_and_upright(tmp_path, undrawn):
     twist.main(twist.Args(out=tmp_path / "twist", quick=True, device="cpu"))
     found = read_metrics(tmp_path / "twist" / "metrics.json")
     assert float(found["twist.min_gap_m"]) > 0.0 and float(found["twist.min_det_f"]) > 0.0
     assert float(found["twist.longest_mm"]) > 0.2 and float(found["twist.twisted_deg"]) > 2.0
-    assert (tmp_path / "twist" / "twist_strip.png").stat().st_size > 1000
 
 
 SHORT_BEAM = """

@@ -49,6 +49,7 @@ def test_an_unknown_level_is_named(tmp_path):
         physics_sheet.Args(out=tmp_path, pad="huge").run()
 
 
+@pytest.mark.slow
 def test_levels_against_a_finer_one(tmp_path):
     physics_sheet.Args(out=tmp_path, quick=True, scenes="sphere", against="medium").run()
     read = read_metrics(tmp_path / "metrics.json")

@@ -33,7 +33,7 @@ def pressed() -> GelSurface:
 @pytest.fixture(scope="module")
 def converged(tracer: Build, pressed: GelSurface) -> dict[str, np.ndarray]:
     mode = tracer(like_a_mini(), integrator="reference")
-    return mode.render_layers(pressed, spp=1024, seed=0)
+    return mode.render_layers(pressed, spp=384, seed=0)
 
 
 @needs_oidn

@@ -40,7 +40,7 @@ def binned(image: np.ndarray, by: int = 2) -> np.ndarray:
 @pytest.mark.parametrize("name", SHAPES)
 def test_without_bounce_it_is_the_direct_light(tracer: Build, tmp_path: Path, spec: SensorSpec, name: str) -> None:
     pressed = shape(spec, name)
-    expected = total(tracer(spec, integrator="reference", max_depth=1, spp=1024, pitch=PITCH).render_layers(pressed))[0]
+    expected = total(tracer(spec, integrator="reference", max_depth=1, spp=512, pitch=PITCH).render_layers(pressed))[0]
     # Four rays a pixel, by way of twice the resolution (a kernel with four rays compiles for longer).
     fine = tracer(spec, bounce=False, led_points=2, pitch=PITCH, resolution=DOUBLE)
     actual = binned(total(fine.render_layers(pressed))[0])

@@ -52,8 +52,8 @@ def test_300_fast_updates_hold_memory_flat(tracer: Build) -> None:
 
 
 @needs_proc
-def test_30_reference_updates_hold_memory_flat(tracer: Build) -> None:
-    assert growth_mb(tracer, 30, warm_up=10, integrator="reference", spp=1, resolution=(32, 24)) < 20
+def test_12_reference_updates_hold_memory_flat(tracer: Build) -> None:
+    assert growth_mb(tracer, 12, warm_up=4, integrator="reference", spp=1, resolution=(32, 24)) < 8
 
 
 @needs_proc

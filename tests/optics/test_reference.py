@@ -65,9 +65,9 @@ def test_error_falls_as_one_over_root_spp(tracer: Build, spec: SensorSpec, press
 def test_one_launch_or_many_is_one_estimate(
     tracer: Build, spec: SensorSpec, pressed: GelSurface, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = [image(tracer, spec, pressed, 64, seed) for seed in (0, 1)]
+    whole = [image(tracer, spec, pressed, 32, seed) for seed in (0, 1)]
     monkeypatch.setattr(reference, "LAUNCH", 8 * TINY[0] * TINY[1])
-    split = [image(tracer, spec, pressed, 64, seed) for seed in (0, 1)]
+    split = [image(tracer, spec, pressed, 32, seed) for seed in (0, 1)]
     assert (whole[0] != split[0]).any()
     sigma = noise(*whole)
     # Launches that shared random numbers would have the noise of fewer samples.

@@ -67,7 +67,7 @@ def test_a_ridge_holds_what_no_pixel_tells() -> None:
 def test_shading_scales_linear_light_in_every_integrator(tracer: Build, integrator: str) -> None:
     """u8 = 255 (gain · even · L + black)^(1/γ) of the layers that the same tracer gives, at rest and pressed."""
     spec = like_a_mini()
-    options = {} if integrator == "fast" else {"spp": 4}
+    options = {} if integrator == "fast" else {"spp": 2, "resolution": (40, 30)}
     shaded = replace(spec, response=replace(spec.response, shading_red=THIRD_DEGREE, shading_blue=(-0.4,)))
     plain, mode = (tracer(one, integrator=integrator, outputs=("rgb", "layers"), **options) for one in (spec, shaded))
     grid = grid_of(spec)

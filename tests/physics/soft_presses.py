@@ -26,3 +26,8 @@ def indent(depth=None, force=None):
 
 def soft(scene, sensor=SENSOR, **settings):
     return SoftPad(sensor, scene, pitch=PITCH, **settings)
+
+
+def uncorrected(scene, sensor=SENSOR, **settings):
+    """For what is said of forces and depths: the correction of the shown surface, which changes neither, is left out."""
+    return soft(scene, sensor, correction=None, **settings)

@@ -13,7 +13,7 @@ from raytac.physics.soft.press_solver import PressSolver
 from raytac.physics.soft.scene import SoftScene
 from raytac.physics.soft.settings import PressControl
 from raytac.specs.press import StageSpec
-from tests.physics.soft_presses import indent, press, soft
+from tests.physics.soft_presses import indent, press, soft, uncorrected
 
 
 def test_a_batch_is_its_single_presses_and_lost_environments_fail_alone():
@@ -94,17 +94,17 @@ def test_steps_that_do_not_converge_are_counted_and_one_that_ends_a_press_is_fol
     scene = press(indent(0.05e-3))
     with monkeypatch.context() as patch:
         steps = Converging(patch)
-        pad = soft(scene)
+        pad = uncorrected(scene)
         assert unconverged(pad.peak(pad.run())) == [0]
         usual = steps.calls
     with monkeypatch.context() as patch:
         steps = Converging(patch, 2, usual)
-        many = soft(scene, num_envs=2)
+        many = uncorrected(scene, num_envs=2)
         state = many.peak(many.run())
         assert steps.calls > usual and unconverged(state) == [2, 0] and not state.failed.any()
     with monkeypatch.context() as patch:
         Converging(patch, *range(usual, usual + 50))
-        many = soft(scene, num_envs=2)
+        many = uncorrected(scene, num_envs=2)
         state = many.peak(many.run())
         assert state.failed.tolist() == [True, False] and unconverged(state)[0] > 1 and unconverged(state)[1] == 0
         many.reset()
@@ -112,16 +112,16 @@ def test_steps_that_do_not_converge_are_counted_and_one_that_ends_a_press_is_fol
 
 
 def test_a_solver_that_never_converges_fails_the_press():
-    pad = soft(press(indent(0.02e-3)), control=PressControl(tolerance=1e-40, refinements=1))
+    pad = uncorrected(press(indent(0.02e-3)), control=PressControl(tolerance=1e-40, refinements=1))
     state = pad.peak(pad.run())
     assert state.failed.all() and unconverged(state)[0] >= 2
 
 
 def test_what_has_failed_is_not_stepped(monkeypatch):
     steps = Converging(monkeypatch)
-    pad = soft(press(indent(0.05e-3)), offsets=np.full((1, 2), np.nan))
+    pad = uncorrected(press(indent(0.05e-3)), offsets=np.full((1, 2), np.nan))
     assert pad.peak(pad.run()).failed.all() and steps.calls == 0
-    many = soft(press(indent(0.05e-3)), num_envs=2, offsets=np.array([[0.0, 0.0], [np.nan, 0.0]]))
+    many = uncorrected(press(indent(0.05e-3)), num_envs=2, offsets=np.array([[0.0, 0.0], [np.nan, 0.0]]))
     assert many.peak(many.run()).failed.tolist() == [False, True] and steps.calls > 0
     assert many.solver is not None and many.solver.scene.failed.tolist() == [False, True]
     many.reset()
@@ -147,13 +147,13 @@ def test_turn_and_shear_by_environment_are_those_of_scenes_of_their_own():
 
 def test_every_environment_has_its_depth():
     depths = np.array([0.2e-3, 0.4e-3])
-    pad = soft(press(indent(0.3e-3)), num_envs=2, depths=depths)
+    pad = uncorrected(press(indent(0.3e-3)), num_envs=2, depths=depths)
     state = pad.peak(pad.run())
     assert state.depth == pytest.approx(depths, abs=2e-6) and state.normal_force[1] > 2 * state.normal_force[0]
 
 
 def test_a_resting_weight_presses_with_its_weight():
-    pad = soft(press(indent(force=0.3), StageSpec("release"), dynamics="affine"))
+    pad = uncorrected(press(indent(force=0.3), StageSpec("release"), dynamics="affine"))
     states = list(pad.run())
     assert not states[1].failed[0]
     assert states[1].normal_force[0] == pytest.approx(0.3, rel=0.01)

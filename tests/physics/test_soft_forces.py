@@ -14,14 +14,14 @@ from raytac.physics.soft.mesh import PadLevel, pad_mesh
 from raytac.physics.soft.pad import SoftPad
 from raytac.physics.soft.press_solver import PressSolver
 from raytac.specs.press import StageSpec
-from tests.physics.soft_presses import FRICTIONLESS, PITCH, RADIUS, SENSOR, indent, press, soft
+from tests.physics.soft_presses import FRICTIONLESS, PITCH, RADIUS, SENSOR, indent, press, soft, uncorrected
 
 
 # By default each of the two tests of Coulomb's law under a falling load has one shape, and the other test the other.
 @pytest.mark.parametrize("kind", [pytest.param("sphere", marks=pytest.mark.slow), "cylinder"])
 def test_a_release_keeps_coulombs_law_and_never_pulls(kind):
     """At every state, the pad sheared: friction within its cone, no force that holds the object back, no vertex in tension."""
-    pad = soft(press(indent(0.6e-3), StageSpec("shear", shear=(0.0, 0.5e-3)), StageSpec("release"), kind=kind))
+    pad = uncorrected(press(indent(0.6e-3), StageSpec("shear", shear=(0.0, 0.5e-3)), StageSpec("release"), kind=kind))
     released = [state for state in pad.run(8) if state.kind == "release"]
     loaded = [state for state in released if state.normal_force[0] > 0.0]
     assert len(loaded) >= 2
@@ -37,7 +37,7 @@ def test_a_release_keeps_coulombs_law_and_never_pulls(kind):
 @pytest.mark.parametrize("kind", ["sphere", "cylinder"])
 def test_a_depth_is_approached_without_passing_it(kind):
     """The states on the way go deeper one by one, bear more one by one, and end at the depth."""
-    pad = soft(press(indent(0.5e-3), kind=kind))
+    pad = uncorrected(press(indent(0.5e-3), kind=kind))
     states = list(pad.run(16))[1:]
     depth, force = (np.array([getattr(state, name)[0] for state in states]) for name in ("depth", "normal_force"))
     assert depth.max() <= 0.5e-3 + 2e-6 and depth[-1] == pytest.approx(0.5e-3, abs=2e-6)
@@ -48,7 +48,7 @@ def test_a_depth_is_approached_without_passing_it(kind):
 
 
 def test_a_press_to_a_force_bears_it_and_a_shear_keeps_it():
-    pad = soft(press(indent(force=1.0), StageSpec("shear", shear=(0.2e-3, 0.0))))
+    pad = uncorrected(press(indent(force=1.0), StageSpec("shear", shear=(0.2e-3, 0.0))))
     states = list(pad.run())
     for state in states[1:]:
         assert not state.failed[0] and state.normal_force[0] == pytest.approx(1.0, rel=0.01)
@@ -61,7 +61,7 @@ def test_a_press_to_a_force_bears_it_and_a_shear_keeps_it():
 def test_a_lowered_force_keeps_coulombs_law(kind):
     """Sheared until it slides, then let up: the force asked for, friction within its cone and less as the force goes, no pull."""
     sensor = replace(SENSOR, gelpad=replace(SENSOR.gelpad, friction=0.3))
-    pad = soft(press(indent(force=1.5), StageSpec("shear", shear=(0.0, 0.5e-3)), indent(force=0.3), kind=kind), sensor)
+    pad = uncorrected(press(indent(force=1.5), StageSpec("shear", shear=(0.0, 0.5e-3)), indent(force=0.3), kind=kind), sensor)
     states = list(pad.run(3))[1:]
     sheared, lowered = states[3:6], states[6:]
     assert sheared[-1].shear_force[0, 1] > 0.25 * sheared[-1].normal_force[0]
@@ -76,7 +76,7 @@ def test_a_lowered_force_keeps_coulombs_law(kind):
     assert (np.diff(dragged) < 0.0).all() and (np.diff(depths) < 0.0).all()
 
 
-@pytest.mark.parametrize("make", [soft, lambda scene: RigidPad(SENSOR, scene, pitch=PITCH)], ids=["soft", "rigid"])
+@pytest.mark.parametrize("make", [uncorrected, lambda scene: RigidPad(SENSOR, scene, pitch=PITCH)], ids=["soft", "rigid"])
 def test_a_force_after_a_depth_begins_from_what_is_borne_and_forgets_no_shear(make):
     scene = press(indent(0.5e-3), StageSpec("shear", shear=(0.2e-3, 0.0)), indent(force=0.7))
     pad = make(scene)
@@ -93,7 +93,7 @@ def test_a_force_that_grows_is_found_in_few_steps(monkeypatch):
     steps = []
     step = PressSolver.step
     monkeypatch.setattr(PressSolver, "step", lambda self, *args: steps.append(1) or step(self, *args))
-    pad = soft(press(indent(force=1.0)))
+    pad = uncorrected(press(indent(force=1.0)))
     states = list(pad.run(8))[1:]
     assert [state.normal_force[0] for state in states] == pytest.approx(list(np.arange(1, 9) / 8), rel=1e-3)
     assert 8 <= len(steps) <= 6 * 8
@@ -102,10 +102,10 @@ def test_a_force_that_grows_is_found_in_few_steps(monkeypatch):
 def test_friction_is_coulombs():
     """A flat face dragged until all of it slides; its rim ploughs a little. Without friction, a ball drags next to nothing."""
     sensor = replace(SENSOR, gelpad=replace(SENSOR.gelpad, friction=0.2))
-    pad = soft(press(indent(0.4e-3), StageSpec("shear", shear=(0.6e-3, 0.0)), kind="cylinder"), sensor)
+    pad = uncorrected(press(indent(0.4e-3), StageSpec("shear", shear=(0.6e-3, 0.0)), kind="cylinder"), sensor)
     state = pad.peak(pad.run())
     assert state.shear_force[0, 0] == pytest.approx(0.2 * state.normal_force[0], rel=0.1)
-    pad = soft(press(indent(0.5e-3), StageSpec("shear", shear=(0.2e-3, 0.0))), FRICTIONLESS)
+    pad = uncorrected(press(indent(0.5e-3), StageSpec("shear", shear=(0.2e-3, 0.0))), FRICTIONLESS)
     state = pad.peak(pad.run())
     assert abs(state.shear_force[0, 0]) < 0.05 * state.normal_force[0]  # facets of a millimetre plough
 
@@ -160,7 +160,7 @@ def test_force_against_depth_is_the_bonded_layers():
     # Of a pad of 16 x 14 mm, whose sides are two thicknesses and more from the contact.
     sensor = replace(FRICTIONLESS, gelpad=replace(FRICTIONLESS.gelpad, size=(16e-3, 14e-3)))
     level = PadLevel(0.6e-3, 6, 2.5, 2.0, 8e-6)
-    pad = soft(press(indent(0.15e-3), indent(0.3e-3)), sensor, level=pad_mesh(sensor.gelpad, level))
+    pad = uncorrected(press(indent(0.15e-3), indent(0.3e-3)), sensor, level=pad_mesh(sensor.gelpad, level))
     force = [state.normal_force[0] for state in pad.run()][1:]
     x, y = np.meshgrid(np.linspace(-5e-3, 5e-3, 1001), np.linspace(-5e-3, 5e-3, 1001))
     gap = np.where(np.hypot(x, y) < RADIUS, RADIUS - np.sqrt(np.maximum(RADIUS**2 - x**2 - y**2, 0.0)), np.inf)

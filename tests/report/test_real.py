@@ -160,7 +160,9 @@ def test_calibrate_writes_a_sensor_that_needs_no_photograph(of_itself: tuple[Pat
     # Fitted without cast shadows, and so rendered, though the sensor that the fit began from casts them.
     assert SENSOR.optics.shadows and not written.optics.shadows
     images = [
-        np.array(TactileSensor(written, device="cpu", optics=RayTraced(shadows=shadows)).press("pins").rgb, int)
+        np.array(
+            TactileSensor(written, device="cpu", resolution=(80, 60), optics=RayTraced(shadows=shadows)).press("pins").rgb, int
+        )
         for shadows in (None, False, True)
     ]
     np.testing.assert_array_equal(images[0], images[1])

@@ -27,7 +27,9 @@ ROOT = Path(__file__).parents[2]
 def command(*args: str, cwd: Path) -> subprocess.Popen[str]:
     env = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     run = [sys.executable, "-m", "raytac", "view", *args]
-    return subprocess.Popen(run, cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    # A shell's job in the background hands down that Ctrl-C is ignored.
+    return subprocess.Popen(run, cwd=cwd, env=env, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), **pipes)
 
 
 def test_it_serves_until_ctrl_c(tmp_path):

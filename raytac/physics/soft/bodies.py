@@ -197,7 +197,9 @@ def object_body(
 
 
 def _checked_surface(name: str, parts: Sequence[Part], sag: float) -> ipc.TriMesh:
-    """``object_surface`` of a body; a mesh that crosses itself is refused, since tests of penetration fail on it.
+    """``object_surface`` of a body; a mesh that crosses itself is refused.
+
+    Tests of penetration fail on it.
 
     Overlapping parts are common in models of robots, and only their outer walls touch anything, so they only cause a warning.
     """
@@ -275,7 +277,10 @@ class SceneRegistry:
         return {name: poses[name].copy() for name, body in self.bodies.items() if body.is_driven}
 
     def friction(self) -> dict[tuple[str, str], float]:
-        """μ by pair of names: with a pad, the body's own if it has one, else the pad's gel's; between bodies, the larger of theirs."""
+        """μ by pair of names.
+
+        With a pad, the body's own if it has one, else the pad's gel's; between bodies, the larger of theirs.
+        """
         mu = {}
         for pad in self.pads.values():
             gel = pad.sensor.gelpad.friction

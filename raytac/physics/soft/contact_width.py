@@ -40,7 +40,9 @@ def holds_force(scene: PressScene, stage: int) -> bool:
 
 
 def warn_if_narrow(cells: np.ndarray, level: object, *, stacklevel: int) -> bool:
-    """Warn of the narrowest of B contacts if it has fewer than ``LEAST_CELLS`` across; returns True if it has.
+    """Warn of the narrowest of B contacts if it has fewer than ``LEAST_CELLS`` across.
+
+    Returns True if it has.
 
     Args:
         cells: from ``cells_across``, shape (B,).

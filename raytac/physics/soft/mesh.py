@@ -57,7 +57,7 @@ class PadMesh:
 
 
 def pad_mesh(gelpad: GelpadSpec, level: str | PadLevel | PadMesh) -> PadMesh:
-    """Mesh of a gelpad, or the mesh itself: six tetrahedra to a cell of a grid that follows the dome.
+    """Mesh of a gelpad, or the mesh itself: six tetrahedra a cell of a grid on the dome.
 
     Cells are mirror images of their neighbours (``ipc.box_mesh``). If all were divided alike, nearly incompressible gel would lock
     (docs/soft-pad.md has the figures).
@@ -113,7 +113,9 @@ _SHEAR_MARGIN = 1.2
 
 
 def pad_stiffness(gelpad: GelpadSpec, area: float) -> np.ndarray:
-    """Upper bound (6, 6) of the stiffness of a rigid contact of ``area`` [m²], pad axes, about its centre: diagonal, [N/m], [N m/rad].
+    """Upper bound (6, 6) of the stiffness of a rigid contact of ``area`` [m²], pad axes.
+
+    About its centre: diagonal, [N/m], [N m/rad].
 
     The sum of two limits of a rigid flat punch of the same area, a = √(area/π), on a bonded layer of thickness t: one much wider than the
     layer (all strain confined: modulus M = E (1 − ν) / ((1 + ν)(1 − 2ν)), shear modulus G over the height t) and one much narrower

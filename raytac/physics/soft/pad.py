@@ -1,4 +1,7 @@
-"""The soft pad: the gel simulated with contact, friction and large deformation; object or case driven, or the object lying free."""
+"""The soft pad: the gel simulated with contact, friction and large deformation.
+
+Object or case are driven, or the object lies free.
+"""
 
 from __future__ import annotations
 

@@ -43,7 +43,10 @@ class PressPlacement:
         self._check_stages(scene)
 
     def poses(self, height: np.ndarray, shear: np.ndarray, twist: np.ndarray) -> np.ndarray:
-        """``pad_from_object`` (B, 4, 4) at ``height`` [m] (B,) above first touch, after ``shear`` (B, 2) and ``twist`` (B,)."""
+        """``pad_from_object`` (B, 4, 4) at ``height`` [m] (B,) above first touch.
+
+        After ``shear`` (B, 2) and ``twist`` (B,).
+        """
         poses = np.tile(np.eye(4), (len(height), 1, 1))
         for b, angle in enumerate(twist):
             poses[b, :3, :3] = about_z(angle) @ self._rotations[b]
@@ -53,7 +56,7 @@ class PressPlacement:
         return poses
 
     def case(self, height: np.ndarray, shear: np.ndarray, twist: np.ndarray) -> np.ndarray:
-        """``world_from_pad`` (B, 4, 4) of a case that moves while the object stays at first touch, as in ``PressRig``."""
+        """``world_from_pad`` (B, 4, 4) of a case that moves; the object stays at first touch."""
         poses = np.tile(np.eye(4), (len(height), 1, 1))
         for b, angle in enumerate(twist):
             rotation = about_z(-angle)

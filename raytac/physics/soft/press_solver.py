@@ -139,7 +139,7 @@ class PressSolver:
         return -self.forces()[:, :, 2].sum(axis=1)
 
     def coat_state(self, driven: np.ndarray) -> CoatState:
-        """Coat, forces and object, for a reader; ``driven``: ``pad_from_object`` (B, 4, 4) of an object that is not free."""
+        """Coat, forces and object for a reader; ``driven``: ``pad_from_object`` (B, 4, 4) or None."""
         free = not self.body.is_driven
         pose = inverse(self._world_from_pad) @ self.scene.pose(OBJECT) if free else driven
         surface = self.scene.skin(OBJECT, PAD) if self.body.is_soft else None

@@ -78,7 +78,7 @@ class CoatState:
     def underside(
         self, b: int, x: np.ndarray, y: np.ndarray, below: float, soft_below: float = np.inf, lowered: float = 0.0
     ) -> np.ndarray:
-        """Underside over pad ``b`` at lines ``x``, ``y`` [m], (Ny, Nx), of what touches it, ``lowered`` [m]; inf where there is none.
+        """Underside over pad ``b`` at lines ``x``, ``y`` [m], (Ny, Nx), ``lowered`` [m]; or inf.
 
         What lies wholly above ``below`` may be missing, of soft objects above ``soft_below`` [m].
         """
@@ -190,7 +190,10 @@ class SoftReader:
     def _correct(
         self, state: CoatState, b: int, places: CoatPlaces, clearance: float, plain: np.ndarray, load: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-        """Height, contact mask and underside (Ny, Nx), coat vertices (V, 3) and residual of pad ``b``, of a ``plain`` height [m]."""
+        """Height, contact mask, underside (Ny, Nx), coat vertices (V, 3) and residual of pad ``b``.
+
+        ``plain``: height without correction [m].
+        """
         assert self.correction is not None
         normal, sampler, tangential = self._stages
         rest, upwards = self.mesh.coat.rest, self._upwards(state, b)
@@ -255,7 +258,10 @@ class SoftReader:
     def _underside(
         self, state: CoatState, b: int, grid: PadGrid, clearance: float = 0.0, smooth: np.ndarray | None = None
     ) -> np.ndarray:
-        """Underside of the shown objects over a grid [m], (Ny, Nx); without what lies far below the ``smooth`` coat, if given."""
+        """Underside of the shown objects over a grid [m], (Ny, Nx).
+
+        Without what lies far below the ``smooth`` coat, if given.
+        """
         under = state.underside(b, grid.x, grid.y, float(grid.rest.max()), lowered=clearance)
         if len(state.objects) > 1 and smooth is not None:
             under[under < smooth - _BEHIND] = np.inf

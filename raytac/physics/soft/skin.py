@@ -53,7 +53,10 @@ class SoftSkin:
 
 
 def _weights(points: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (P, K) that each of the ``points`` (P, 3) depends on, and their weights (P, K), which sum to 1; 0 beyond their radius."""
+    """Vertices (P, K) that each of ``points`` (P, 3) depends on, and their weights (P, K).
+
+    Weights sum to 1 and are 0 beyond their radius.
+    """
     most = min(_NEIGHBOURS, len(vertices)) - 1
     chunks = [points[k : k + _CHUNK] for k in range(0, len(points), _CHUNK)]
     reach = _WIDER * max(float(np.sqrt(np.partition(_squares(chunk, vertices), most, axis=1)[:, most].max())) for chunk in chunks)
@@ -77,7 +80,8 @@ def _weights(points: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.n
 
 def _squares(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     """Squared distances [m²], (P, n)."""
-    return ((points[:, None] - vertices[None]) ** 2).sum(axis=-1)
+    x, y, z = ((points[:, None, k] - vertices[:, k]) ** 2 for k in range(3))
+    return x + y + z
 
 
 def _subdivide(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
@@ -96,7 +100,10 @@ def _subdivide(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple
 
 
 def _split(faces: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Triangles (T, 3) divided at the vertices in the ``middle`` (T, 3) of their edges (01, 12, 20), −1 where an edge stays whole."""
+    """Triangles (T, 3) divided at the vertices in the ``middle`` (T, 3) of their edges.
+
+    Edges 01, 12, 20; −1 where an edge stays whole.
+    """
     count = int((middle[0] >= 0).sum())
     if count == 0:
         return faces

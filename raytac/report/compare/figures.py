@@ -1,4 +1,4 @@
-"""Pictures of a comparison: error against time, and a sheet of images with their signed errors for each scene."""
+"""Pictures of a comparison: error against time, and images with signed errors by scene."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Look:
 
 
 def write_pareto(comparison: Comparison, path: Path) -> None:
-    """Error against time of a frame, log axes: whole frame, contact, shadow ring; a row a resolution.
+    """Error against time of a frame, log axes: frame, contact, shadow ring; a row a resolution.
 
     A point is a mode: median of times and mean of errors over the scenes, whiskers from the best scene to the worst. The hatched band is
     the mean noise of the reference, below which no error can be resolved.
@@ -150,7 +150,10 @@ def signed_error(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def error_range(errors: Sequence[np.ndarray]) -> float:
-    """A round number of levels that the signed errors seldom exceed: 99th percentile of the middle image, at least 2."""
+    """A round number of levels that the signed errors seldom exceed, at least 2.
+
+    It is the 99th percentile of the middle image.
+    """
     if not errors:
         return 2.0
     typical = statistics.median(float(np.percentile(np.abs(error), 99)) for error in errors)
@@ -158,7 +161,7 @@ def error_range(errors: Sequence[np.ndarray]) -> float:
 
 
 def write_sheet_of_scene(comparison: Comparison, scene: str, resolution: str, path: Path, columns: int = 6) -> None:
-    """The reference, then every mode with its signed error below it; one colour scale for the whole sheet."""
+    """The reference, then every mode with its signed error below it; one colour scale."""
     rows = select(comparison.rows, scene=scene, resolution=resolution)
     reference = comparison.references[scene, resolution]
     compared = [row for row in rows if row.figures["frame_mae"] is not None]

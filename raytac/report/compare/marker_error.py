@@ -1,4 +1,4 @@
-"""Error and time of the cheap marker models against surface tracking, on presses that no fit has seen."""
+"""Error and time of cheap marker models against surface tracking, on held-out presses."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class MarkerErrors:
 
     @property
     def truth(self) -> dict[str, float]:
-        """Mean displacement by surface tracking [m] by kind of load: the error of a model that never moves a marker."""
+        """Mean displacement by surface tracking [m], by load: the error of unmoved markers."""
         return {row.load: row.size for row in self.errors}
 
     def by_model(self) -> list[tuple[str, list[ModelError], float]]:
@@ -71,7 +71,7 @@ def marker_errors(sensor: SensorSpec, frames: list[PressFrame], *, pad: str, dev
 
 
 def marker_error_metrics(errors: MarkerErrors | None) -> dict[str, Metric]:
-    """``markers.<pad>.<model>.<load>.<figure>`` and ``markers.<pad>.<model>.ms_per_frame``; nothing of None."""
+    """Keys ``markers.<pad>.<model>.<load>.<figure>`` and ``.ms_per_frame``; none for None."""
     if errors is None:
         return {}
     key = f"markers.{errors.pad}"

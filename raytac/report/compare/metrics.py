@@ -1,4 +1,4 @@
-"""Figures over all scenes of a comparison: summary of each mode, equal error, and the flat keys of ``metrics.json``."""
+"""Figures over all scenes of a comparison: summary by mode, equal error, flat keys."""
 
 from __future__ import annotations
 
@@ -221,7 +221,10 @@ def _row_metrics(row: Row) -> dict[str, Metric]:
 
 
 def _against_peer(rows: Sequence[Row], shadow: str) -> dict[str, Metric]:
-    """Time of the package over ours at the largest resolution that both ran at, medians over scenes, batch 1."""
+    """Time of the package over ours at the largest common resolution, batch 1.
+
+    Medians over scenes.
+    """
     metrics: dict[str, Metric] = {}
     for resolution in resolutions(rows):
         here = select(rows, resolution=resolution)
@@ -233,7 +236,7 @@ def _against_peer(rows: Sequence[Row], shadow: str) -> dict[str, Metric]:
 
 
 def spp_for_error(spp: Sequence[int], errors: Sequence[float], target: float) -> float:
-    """Samples a pixel at which path tracing has the error ``target``, at least the first of ``spp``.
+    """Samples a pixel at which path tracing has the error ``target``, at least ``spp[0]``.
 
     Between the measured points log error is linear in log spp; beyond the last, error falls as spp^−1/2.
     """
@@ -244,5 +247,5 @@ def spp_for_error(spp: Sequence[int], errors: Sequence[float], target: float) ->
 
 
 def cost_at(spp: Sequence[int], ms: Sequence[float], wanted: float) -> float:
-    """Time [ms] at ``wanted`` samples: linear between the measured points, proportional beyond the last."""
+    """Time [ms] at ``wanted`` samples: linear between points, proportional beyond the last."""
     return float(ms[-1] * wanted / spp[-1]) if wanted > spp[-1] else float(np.interp(wanted, spp, ms))

@@ -1,4 +1,4 @@
-"""Optical modes of a comparison and their settings: all registered modes, and the package ``taxim``."""
+"""Optical modes of a comparison: all registered modes, and the package ``taxim``."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Mode:
 
 
 class _Sampled:
-    """A mode with noise at one number of samples; several share one tracer, which is costly to build."""
+    """A mode with noise at one number of samples; several share one costly tracer."""
 
     def __init__(self, mode: Any, spp: int, seed: int) -> None:
         self._render = partial(mode.render, spp=spp, seed=seed)
@@ -76,7 +76,10 @@ class _Sampled:
 
 
 def comparison_modes(spp: Sequence[int] = (1, 4, 16, 64), *, quick: bool = False) -> tuple[Mode, ...]:
-    """Every mode of the comparison; the sampled ones once for each of ``spp`` samples a pixel. ``quick`` builds no costly variants."""
+    """Every mode of the comparison; the sampled ones once for each of ``spp``.
+
+    ``quick`` builds no costly variants.
+    """
     modes = []
     for name in OPTICS.names:
         for variant in OPTICS.config_class(name).variants():

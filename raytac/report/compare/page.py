@@ -1,4 +1,4 @@
-"""Write a comparison: report.html, pareto.png, a sheet of images a scene, results.parquet and metrics.json."""
+"""Files of a comparison: report, figures, sheets of images, table, metrics."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ TEMPLATE = "compare_report.html.j2"
 
 
 def write_comparison(comparison: Comparison, out: Path, wall_s: float) -> list[Path]:
-    """Write all files of the report into ``out`` at once; those of an earlier run are replaced, sheets of other scenes removed.
+    """Write all files of the report into ``out`` at once, in place of those of an earlier run.
+
+    Sheets of other scenes are removed.
 
     Returns the files written. ``wall_s`` is the time of this run.
     """

@@ -1,4 +1,4 @@
-"""The PyPI package ``taxim`` as a peer: its own sensor and calibration, timed on the same contacts."""
+"""The PyPI package ``taxim`` as a peer: its own sensor and table, on the same contacts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ AWAY_MM = 5.0
 
 
 def contact_height_map(surface: GelSurface, size: tuple[int, int], width_mm: float) -> np.ndarray:
-    """Object's underside as the package wants it: (B, H, W) float32 [mm], 0 at the gel's highest point, negative inside.
+    """Object's underside for the package: (B, H, W) float32 [mm], 0 at the gel's top.
+
+    Negative inside.
 
     Where there is contact the gel's surface is the object's underside; elsewhere the object counts as ``AWAY_MM`` off, since the package
     deforms the gel by itself. Pixels are squares of ``width_mm`` / W, centred on the pad.
@@ -66,7 +68,7 @@ class PeerTaxim:
         self._inputs: dict[int, tuple[GelSurface, np.ndarray]] = {}
 
     def render(self, surface: GelSurface) -> OpticsImages:
-        """Images (B, H, W, 3) uint8; the height map of a surface is made once, so that repeated calls time the package alone."""
+        """Images (B, H, W, 3) uint8; repeated calls with a surface time the package alone."""
         if id(surface) not in self._inputs:
             width_mm = self.taxim.sensor_params.pixmm * self.taxim.width
             self._inputs[id(surface)] = surface, contact_height_map(surface, self.size, width_mm)

@@ -1,4 +1,4 @@
-"""Error of the rigid pad, with its Gaussians, against the soft pad on the same presses: height and image."""
+"""Error of the rigid pad against the soft pad on the same presses: height and image."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from raytac.specs import load_press
 
 @dataclass(frozen=True)
 class PhysicsError:
-    """Differences of one press on both pads: RMS of height [µm], MAE of ``fast`` [levels of 255]."""
+    """Differences of one press on both pads: RMS of height [µm], MAE of ``fast`` [levels]."""
 
     scene: str
     resolution: str

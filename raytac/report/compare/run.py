@@ -1,4 +1,4 @@
-"""``raytac compare``: every optical mode on the same gel surfaces in one run, error beside time.
+"""``raytac compare``: every optical mode on the same gel surfaces, error beside time.
 
 Rows (scene x resolution x mode) are measured one after another and kept in ``out/rows``, converged references in ``out/references``:
 the same command run again goes on where it stopped.
@@ -204,7 +204,7 @@ class _Run:
         )
 
     def _digest(self, mode: Mode) -> str:
-        """Digest of the code behind a mode's row; reading sources takes a while, so each is read once."""
+        """Digest of the code behind a mode's row; each source is read once."""
         code = mode.code()
         if code not in self._digests:
             self._digests[code] = code_digest(*code, *CODE)
@@ -268,7 +268,10 @@ class _Run:
         return figures | {"batch_ms_per_frame": float(np.median(calls)) / self.batch, "batch_calls": len(calls)}
 
     def _memory(self, built: OpticalMode, surface: GelSurface, batched: bool) -> dict[str, Value]:
-        """Peak of the device arrays of one call, and its growth per environment [MiB]; None if not Dr.Jit."""
+        """Peak of the device arrays of one call, and its growth per environment [MiB].
+
+        None if not Dr.Jit.
+        """
         from raytac.optics.runtime import peak_bytes
 
         one, many = (moving([surface], n, 1)[0] for n in (1, self.batch))
@@ -281,7 +284,7 @@ class _Run:
 
 
 class _Scene:
-    """One press at one resolution, with what its rows are compared to; masks are made when a row needs them."""
+    """One press at one resolution, with its references; masks are made when a row needs them."""
 
     def __init__(self, name: str, surface: GelSurface, references: References, tracers: Tracers, size: tuple[int, int]) -> None:
         self.name, self.surface, self._tracers, self._size = name, surface, tracers, size
@@ -297,7 +300,10 @@ class _Scene:
 
     @cached_property
     def noise(self) -> dict[str, dict[str, float]]:
-        """Noise of the reference by region: half the difference of independent halves varies as their mean."""
+        """Noise of the reference by region.
+
+        Half the difference of independent halves varies as their mean.
+        """
         one, two = self._halves
         figures = {}
         for region, mask in self.masks.items():

@@ -1,4 +1,4 @@
-"""Finished rows of a long comparison, kept on disk so that an interrupted run goes on where it stopped."""
+"""Finished rows of a comparison on disk, so that an interrupted run goes on."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ Value = str | int | float | bool | None
 
 @dataclass(frozen=True)
 class Row:
-    """Figures of one scene, resolution and mode by column name, None where one is not defined or not known; and the image."""
+    """Figures of one scene, resolution and mode by column name; and the image.
+
+    A figure is None where it is not defined or not known.
+    """
 
     figures: dict[str, Value]
     image: np.ndarray
@@ -46,7 +49,7 @@ class RowStore:
         self.folder, self.say = Path(folder), say
 
     def read(self, name: str, key: str) -> Row | None:
-        """The row written under ``name`` and ``key``, or None if there is none or its files are damaged."""
+        """The row written under ``name`` and ``key``; None if there is none or it is damaged."""
         path = self._path(name, key)
         if not path.is_file():
             return None
@@ -62,7 +65,7 @@ class RowStore:
             return None
 
     def write(self, name: str, key: str, row: Row) -> None:
-        """Keep a row; the JSON file comes last, so that an interrupt leaves no row that looks finished."""
+        """Keep a row; the JSON file comes last, so that no interrupted row looks finished."""
         self.folder.mkdir(parents=True, exist_ok=True)
         path = self._path(name, key)
         write_atomic(path.with_suffix(".png"), png_bytes(row.image))
@@ -87,7 +90,10 @@ def _digest_image(image: np.ndarray) -> str:
 
 
 class References:
-    """Images of the ``reference`` integrator without limit of depth, in ``folder`` under a hash of all that shapes them."""
+    """Images of the ``reference`` integrator without limit of depth, kept in ``folder``.
+
+    Their names are hashes of all that shapes them.
+    """
 
     def __init__(
         self, folder: Path, tracers: Tracers, size: tuple[int, int], spp: int, say: Callable[[str], object] = print
@@ -100,11 +106,11 @@ class References:
         self._basis = "\n".join(basis).encode()
 
     def key(self, surface: GelSurface) -> str:
-        """Content hash of sensor, lights, surface, size, samples, seed, device, versions and code; 20 hex digits."""
+        """Hash of sensor, surface, size, samples, seed, device, versions and code; 20 hex digits."""
         return hashlib.sha256(self._basis + surface.height.astype(np.float32).tobytes()).hexdigest()[:20]
 
     def halves(self, scene: str, surface: GelSurface) -> np.ndarray:
-        """Two linear images of ``spp`` / 2 samples and independent seeds, (2, H, W, 3); read if kept."""
+        """Two linear images of ``spp`` / 2 samples and own seeds, (2, H, W, 3); read if kept."""
         path = self.folder / f"{scene}-{self.key(surface)}.npz"
         kept = self._read(path)
         if kept is not None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import ipc
+from ipc.contact import overlap
 from ipc.contact.overlap import APART, CROSSING, TOUCHING, meet, orientation
 from tests.ipc.conftest import turns, unit_cell
 
@@ -143,3 +144,18 @@ def test_a_world_says_where_surfaces_cross() -> None:
     assert "through triangle" in str(world.overlap(1))
     with pytest.raises(ipc.IpcError, match="environments are 0 to 1"):
         world.overlap(2)
+
+
+@pytest.mark.parametrize("count", [(0, 0), (1, 300), (700, 500)])
+def test_boxes_are_paired_as_by_comparing_all_with_all(count: tuple[int, int]) -> None:
+    rng = np.random.default_rng(0)
+    low, high = [], []
+    for n in count:
+        low.append(np.vstack([rng.uniform(size=(n, 3)), np.full((1, 3), 0.5)]))
+        high.append(low[-1] + rng.uniform(0.0, 0.2, size=low[-1].shape))
+    high[1][-1] = low[1][-1]  # a point, which the last of the others touches with a corner
+    i, j = overlap._box_pairs(low[0], high[0], low[1], high[1])
+    meets = (low[0][:, None] <= high[1]).all(axis=-1) & (high[0][:, None] >= low[1]).all(axis=-1)
+    np.testing.assert_array_equal(np.stack([i, j]), np.stack(np.nonzero(meets)))
+    apart, _ = overlap._box_pairs(low[0] + 9.0, high[0] + 9.0, low[1], high[1])
+    assert len(apart) == 0

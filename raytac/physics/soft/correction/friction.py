@@ -78,7 +78,7 @@ def plane_waves(along_x: CosineSeries, along_y: CosineSeries, x: np.ndarray, y: 
 
 
 def plane_displacement(waves: np.ndarray, lines: Lines) -> np.ndarray:
-    """Displacement along x and y [m], (2, Ny, Nx), of amplitudes (2, Ky, Kx) over the lines of ``plane_waves``."""
+    """Displacement along x and y [m], (2, Ny, Nx), of amplitudes (2, Ky, Kx) of plane waves."""
     (cos_x, sin_x), (cos_y, sin_y) = lines
     return np.stack([sandwich(cos_y, waves[0], sin_x), sandwich(sin_y, waves[1], cos_x)])
 

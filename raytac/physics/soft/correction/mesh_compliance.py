@@ -59,7 +59,7 @@ class _Sparse:
 
 
 def rest_stiffness(mesh: PadMesh, gelpad: GelpadSpec) -> _Sparse:
-    """Stiffness of all vertices [N/m], (3n, 3n), unknown 3 v + axis: linear elasticity on constant-strain tetrahedra.
+    """Stiffness of all vertices [N/m], (3n, 3n), unknown 3 v + axis, by linear elasticity.
 
     A tetrahedron of volume V whose shape functions have gradients g adds V (λ g_a g_bᵀ + μ g_b g_aᵀ + μ (g_a · g_b) 1) to block (a, b).
     """
@@ -74,12 +74,14 @@ def rest_stiffness(mesh: PadMesh, gelpad: GelpadSpec) -> _Sparse:
     block = lame * outer + shear * np.swapaxes(outer, 3, 4)
     block += shear * np.einsum("tac,tbc->tab", slope, slope)[..., None, None] * np.eye(3)
     block *= (np.abs(np.linalg.det(edges)) / 6.0)[:, None, None, None, None]
-    unknown = 3 * tets[:, :, None] + np.arange(3)
-    row = np.broadcast_to(unknown[:, :, None, :, None], block.shape).ravel()
-    column = np.broadcast_to(unknown[:, None, :, None, :], block.shape).ravel()
-    n = 3 * len(vertices)
-    place, back = np.unique(row.astype(np.int64) * n + column, return_inverse=True)
-    return _Sparse(place // n, place % n, np.bincount(back, block.ravel()), (n, n))
+    n = len(vertices)
+    pair, back = np.unique(tets[:, :, None].astype(np.int64) * n + tets[:, None, :], return_inverse=True)
+    entry = (9 * back.reshape(len(tets), 4, 4, 1, 1) + np.arange(9).reshape(3, 3)).ravel()
+    row, column = 3 * (pair // n)[:, None, None] + np.arange(3)[:, None], 3 * (pair % n)[:, None, None] + np.arange(3)
+    row, column = (np.broadcast_to(x, (len(pair), 3, 3)).ravel() for x in (row, column))
+    value = np.bincount(entry, block.ravel(), 9 * len(pair))
+    order = np.argsort(row * 3 * n + column, kind="stable")
+    return _Sparse(row[order], column[order], value[order], (3 * n, 3 * n))
 
 
 def _layers(mesh: PadMesh) -> np.ndarray:
@@ -178,9 +180,14 @@ def _condensed(stiffness: _Sparse, basis: _Sparse, layer: np.ndarray, on_coat: n
             coupling = block(depth, depth + 1)
             here -= coupling @ inverse @ coupling.T
         inverse = np.linalg.inv(here)
-    spread = np.zeros((3, len(np.flatnonzero(on_coat >= 0)), sizes[0]))
+    # On the coat every component of a vertex is one unknown, times its weight; without an unknown the weight is 0.
+    unknown, share = (np.zeros((3, int(on_coat.max()) + 1), dtype) for dtype in (int, float))
     for axis in range(3):
         top = np.flatnonzero((column_of >= 0) & (np.arange(n) % 3 == axis) & (on_coat[np.arange(n) // 3] >= 0))
-        spread[axis, on_coat[top // 3], place[column_of[top]]] = weight[top]
-    responses = [inverse @ spread[axis].T for axis in along]
-    return np.stack([[side @ response for side in spread] for response in responses])
+        unknown[axis, on_coat[top // 3]], share[axis, on_coat[top // 3]] = place[column_of[top]], weight[top]
+    result = np.zeros((len(along), 3, *(unknown.shape[1],) * 2))
+    for one, axis in zip(result, along, strict=True):
+        response = inverse[:, unknown[axis]] * share[axis]
+        for side in range(3):
+            one[side] = share[side][:, None] * response[unknown[side]]
+    return result

@@ -107,7 +107,7 @@ class NormalCorrection:
         continued: np.ndarray,
         settings: Correction = DEFAULT_CORRECTION,
     ) -> None:
-        """Prepare the fine grid of lines ``x`` (Nx,), ``y`` (Ny,) [m], evenly spaced from edge to edge of the pad.
+        """Prepare the fine grid of even lines ``x`` (Nx,), ``y`` (Ny,) [m], from edge to edge.
 
         Args:
             compliance: z of the coat's vertices over a force along z on each [m/N], (V, V), of the pad's mesh.
@@ -158,7 +158,10 @@ class NormalCorrection:
         return load > self.settings.least_load * load.max()
 
     def _mesh_forces(self, upwards: np.ndarray, touching: np.ndarray) -> np.ndarray:
-        """Forces along z [N], (V,), on ``touching`` vertices under which the linear mesh has ``upwards`` there; 0 where it is bonded."""
+        """Forces along z [N], (V,), on ``touching`` vertices that lift the linear mesh ``upwards``.
+
+        0 where it is bonded.
+        """
         free = touching & (np.diagonal(self._compliance) > 0.0)
         forces = np.zeros(len(upwards))
         forces[free] = np.linalg.solve(self._compliance[np.ix_(free, free)], upwards[free])
