@@ -25,8 +25,8 @@ from __future__ import annotations
 
 import warp as wp
 
+from raytac.physics.rigid.contact_rows import Rows
 from raytac.physics.rigid.motion_kernels import place_of, turn_of
-from raytac.physics.rigid.search_kernels import Rows
 from raytac.physics.rigid.shear_kernels import begin_shear, clear_shear, move_shear
 from raytac.physics.rigid.spring_kernels import normal_spring
 from raytac.physics.rigid.step_kernels import law_of

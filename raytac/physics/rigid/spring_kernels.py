@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.physics.rigid.search_kernels import Rows
+from raytac.physics.rigid.contact_rows import Rows
 from raytac.physics.rigid.table_kernels import Law, force_at
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.physics.rigid.search_kernels import Rows
+from raytac.physics.rigid.contact_rows import Rows
 from raytac.physics.rigid.table_kernels import Law, force_at
 from raytac.physics.rigid.world_kernels import (
     Differences,

@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import warp as wp
 
+from raytac.physics.rigid.contact_rows import Rows
 from raytac.physics.rigid.contacts import LAW_POINTS
 from raytac.physics.rigid.load_law import HARD_FROM, HARD_RISE
-from raytac.physics.rigid.search_kernels import Rows
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
