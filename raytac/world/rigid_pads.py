@@ -11,7 +11,7 @@ MuJoCo's own collision uses a convex hull of the body, and its number of contact
   Tabor, Hysteresis losses in rolling and sliding friction, Proc. R. Soc. A 259, 1961) with α the gel's hysteresis.
 
 All environments step together: in every step of MuJoCo their contacts are computed at once, and MuJoCo is called for one after the other.
-Where something moves fast near a pad, that environment takes shorter steps (``StepChoice``), each half as long as the scene's, a quarter …
+Where something moves fast near a pad, that environment takes shorter steps (``choose_steps``): half of the scene's, a quarter …
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ def test_scripted_policies_succeed_without_losing_a_contact(name: str) -> None:
 
 
 def test_what_is_measured_is_written_and_a_shorter_step_sinks_less(tmp_path) -> None:
-    args = scene_steps.Args(out=tmp_path / "run", scenes=("push_cube",), steps_ms=(10.0, 2.0), episodes=1, device="cpu")
+    args = scene_steps.Args(out=tmp_path / "run", scenes=("push_cube",), steps_ms=(10.0, 2.0), episodes=2, device="cpu", seed=2)
     scene_steps.main(args)
     found = read_metrics(tmp_path / "run" / "metrics.json")
     assert found["scene_steps.push_cube.shipped_ms"] == 10.0
