@@ -52,7 +52,13 @@ class ActionControl:
         self._has_grip = "grip" in motion.axes
         fingers = np.arange(world.model.nq)[composed.fingers] if self._has_grip else np.zeros(0, int)
         arm = self.arm.numbers()
-        known = {"tool": arm["site"], "joints": arm["joints"], "speed": arm["speed"], "fingers": numbers("qpos", fingers)}
+        known = {
+            "time": arm["time"],
+            "tool": arm["site"],
+            "joints": arm["joints"],
+            "speed": arm["speed"],
+            "fingers": numbers("qpos", fingers),
+        }
         self._reader = StateReader(data, known)
         self.size = len(motion.axes) if action == "pose" else len(self.arm) + self._has_grip
         self.opening_range = motion.opening if self._has_grip else ()
@@ -84,7 +90,7 @@ class ActionControl:
         now = self._reader.values()
         fingers = now["fingers"]
         opening = fingers.sum(axis=1, keepdims=True) if self._has_grip else fingers
-        return ToolState(now["tool"], now["joints"], now["speed"], opening)
+        return ToolState(now["time"], now["tool"], now["joints"], now["speed"], opening)
 
     def reset(self, envs: Sequence[int] | range) -> None:
         """Set the targets of environments to their present poses."""
@@ -115,7 +121,7 @@ class ActionControl:
             step = self.motion.step[self.motion.axes.index("grip")]
             low, high = self.motion.opening
             self._gap = np.clip(self._gap + step * actions[:, -1], low, high)
-        self._springs.aim(joints, speed, np.array([data.time for data in self.world.data]), self._gap[:, None])
+        self._springs.aim(joints, speed, now.time, self._gap[:, None])
         return _Follow(self._springs)
 
     def _move_pose(self, actions: np.ndarray, tool: np.ndarray) -> None:
@@ -139,6 +145,8 @@ class ActionControl:
 class ToolState:
     """Arm of B environments by its joints."""
 
+    time: np.ndarray
+    """Since the reset [s], (B,)."""
     tool: np.ndarray
     """Poses (B, 4, 4) of the tool: where its pad would be if it were mounted without error."""
     joints: np.ndarray

@@ -77,10 +77,12 @@ class Arm:
     def numbers(self) -> dict[str, Numbers]:
         """Numbers of this arm in a state, for a ``StateReader``.
 
-        ``joints``, ``speed``, ``bias`` (n,), ``mass`` (n, n), ``anchor``, ``axis`` (n, 3) of the joints, world axes, and ``site`` (4, 4).
+        ``time`` (), ``joints``, ``speed``, ``bias`` (n,), ``mass`` (n, n), ``anchor``, ``axis`` (n, 3) of the joints, world axes, and
+        ``site`` (4, 4).
         """
         vectors = 3 * self._ids[:, None] + np.arange(3)
         return {
+            "time": numbers("time", np.array(0)),
             "joints": numbers("qpos", self.qpos),
             "speed": numbers("qvel", self.dof),
             "bias": numbers("qfrc_bias", self.dof),

@@ -86,8 +86,9 @@ class Springs:
     bias: wp.array2d(dtype=wp.float64)
     target: wp.array2d(dtype=wp.float64)
     target_speed: wp.array2d(dtype=wp.float64)
-    elapsed: wp.array(dtype=wp.float64)
-    """Time [s] since the targets held."""
+    time: wp.array(dtype=wp.float64)
+    start: wp.array(dtype=wp.float64)
+    """Time [s] at which the targets hold."""
     stiffness: wp.float64
     damping: wp.float64
     torque: wp.array2d(dtype=wp.float64)
@@ -95,12 +96,12 @@ class Springs:
 
 @wp.kernel
 def joint_springs(springs: Springs):
-    """τ = M (k (q_d + q̇_d t − q) + d (q̇_d − q̇)) + bias."""
+    """τ = M (k (q_d + q̇_d t − q) + d (q̇_d − q̇)) + bias, with t the time since the start."""
     env, i = wp.tid()
     value = springs.bias[env, i]
     for k in range(springs.joints.shape[1]):
         speed = springs.target_speed[env, k]
-        ahead = springs.target[env, k] + springs.elapsed[env] * speed - springs.joints[env, k]
+        ahead = springs.target[env, k] + (springs.time[env] - springs.start[env]) * speed - springs.joints[env, k]
         value += springs.mass[env, i, k] * (springs.stiffness * ahead + springs.damping * (speed - springs.speed[env, k]))
     springs.torque[env, i] = value
 

@@ -14,7 +14,7 @@ from raytac.robots.arm import Arm
 from raytac.robots.arm_kernels import Springs, joint_springs
 from raytac.robots.states import ControlWriter, StateReader
 
-_READ = ("joints", "speed", "bias", "mass")
+_READ = ("time", "joints", "speed", "bias", "mass")
 
 
 class JointSprings:
@@ -32,18 +32,17 @@ class JointSprings:
         self._reader = StateReader(self._datas, {name: one for name, one in arm.numbers().items() if name in _READ})
         self._writer = None if arm.motors is None else ControlWriter(self._datas, [*arm.motors.tolist(), *others])
         springs = Springs()
-        springs.joints, springs.speed, springs.bias, springs.mass = (self._reader.arrays[name] for name in _READ)
+        springs.time, springs.joints, springs.speed, springs.bias, springs.mass = (self._reader.arrays[name] for name in _READ)
         springs.target, springs.target_speed = (wp.zeros((count, n), dtype=wp.float64, device="cpu") for _ in range(2))
-        springs.elapsed = wp.zeros(count, dtype=wp.float64, device="cpu")
+        springs.start = wp.zeros(count, dtype=wp.float64, device="cpu")
         springs.stiffness, springs.damping = frequency**2, 2.0 * damping_ratio * frequency
         if self._writer is None:
             springs.torque = wp.zeros((count, n), dtype=wp.float64, device="cpu")
         else:
             springs.torque = self._writer.controls
         self._target, self._speed = springs.target.numpy(), springs.target_speed.numpy()
-        self._elapsed, controls = springs.elapsed.numpy(), springs.torque.numpy()
+        self._start, controls = springs.start.numpy(), springs.torque.numpy()
         self._torque, self._others = controls[:, :n], controls[:, n:]
-        self._start = np.zeros(count)
         self._law: Any = wp.launch(joint_springs, dim=(count, n), inputs=[springs], device="cpu", record_cmd=True)
 
     def is_for(self, datas: Sequence[mujoco.MjData]) -> bool:
@@ -59,7 +58,6 @@ class JointSprings:
 
     def torque(self) -> np.ndarray:
         """Torques (B, n) [N·m] for the present states; the array is overwritten by the next call."""
-        np.subtract([data.time for data in self._datas], self._start, out=self._elapsed)
         self._reader.read()
         self._law.launch()
         return self._torque

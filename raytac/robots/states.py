@@ -6,6 +6,8 @@ arrays that are named here stay where they are as long as the state lives, so th
 
 from __future__ import annotations
 
+import ctypes
+import functools
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +17,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from raytac.errors import InputError
+from raytac.errors import BackendError, InputError
 from raytac.physics.rigid.warp_cache import start_warp
 from raytac.robots.state_kernels import Entries, read_numbers, write_numbers
 
@@ -35,7 +37,7 @@ class Numbers:
 
 
 def numbers(name: str, index: np.ndarray) -> Numbers:
-    """Entries ``index`` (…) of a member of ``MjData``, as a flat array; 0 where an index is negative."""
+    """Entries ``index`` (…) of a member of ``MjData``, as a flat array, or of ``time``; 0 where an index is negative."""
     flat = np.asarray(index, int).ravel().tolist()
     return Numbers(tuple(name if i >= 0 else "" for i in flat), tuple(max(i, 0) for i in flat), np.shape(index))
 
@@ -94,7 +96,7 @@ class StateReader:
             key: wp.array(ptr=self._flat.ptr + part.start * 8, shape=shape, dtype=wp.float64, device="cpu")
             for key, (part, shape) in self._parts.items()
         }
-        places = np.array([[_place(getattr(data, name)) for name in names] for data in self._datas], np.uint64)
+        places = np.array([[_place(data, name) for name in names] for data in self._datas], np.uint64)
         entries = Entries()
         entries.places, entries.values = wp.array(places, dtype=wp.uint64, device="cpu"), self._flat
         for name, column in (("member", member), ("index", index), ("start", start), ("stride", stride)):
@@ -132,7 +134,7 @@ class ControlWriter:
         self._values = self.controls.numpy()
         self._chosen = wp.zeros(count, dtype=wp.int32, device="cpu")
         self._mask = self._chosen.numpy()
-        places = wp.array([_place(data.ctrl) for data in self._datas], dtype=wp.uint64, device="cpu")
+        places = wp.array([_place(data, "ctrl") for data in self._datas], dtype=wp.uint64, device="cpu")
         inputs = [places, wp.array(list(actuators), dtype=wp.int32, device="cpu"), self.controls, self._chosen]
         self._write: Any = wp.launch(write_numbers, dim=self.controls.shape, inputs=inputs, device="cpu", record_cmd=True)
 
@@ -159,12 +161,30 @@ def _check(datas: Sequence[mujoco.MjData], entries: Numbers) -> None:
             last[name] = max(index, last.get(name, 0))
     for name, index in last.items():
         for data in datas:
-            values = getattr(data, name)
+            values = np.zeros(1) if name == "time" else getattr(data, name)
             known = isinstance(values, np.ndarray) and values.dtype == float and not name.startswith(("efc_", "contact"))
             if not known or index >= values.size:
                 raise InputError("numbers", value=(name, index), rule="must be of float64 members of fixed size, and within them")
 
 
-def _place(values: np.ndarray) -> int:
-    """Address of an array."""
-    return int(values.__array_interface__["data"][0])
+def _place(data: mujoco.MjData, name: str) -> int:
+    """Address of an array of a state, or of its time."""
+    if name == "time":
+        return data._address + _time_offset()
+    return int(getattr(data, name).__array_interface__["data"][0])
+
+
+@functools.cache
+def _time_offset() -> int:
+    """Offset of the time in MuJoCo's structure of a state [byte]. Python asks each state for it, which takes longer than all its arrays.
+
+    It is where a number that is set as the time is seen first. Raises ``BackendError`` if another one is not seen there.
+    """
+    data, offset = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>")), 0
+    data.time = 0.12345678901234567
+    while ctypes.c_double.from_address(data._address + offset).value != data.time:
+        offset += 8
+    data.time = 0.76543210987654321
+    if ctypes.c_double.from_address(data._address + offset).value != data.time:
+        raise BackendError(f"MuJoCo {mujoco.__version__} keeps the time of a state in an unknown place")
+    return offset

@@ -19,7 +19,7 @@ from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
 from raytac.physics.soft.availability import check_solver
 from raytac.robots.arm import Arm
 from raytac.robots.impedance import JointImpedance
-from raytac.robots.states import Numbers, StateReader, body_pose, site_pose
+from raytac.robots.states import Numbers, StateReader, body_pose, numbers, site_pose
 from raytac.se3 import quaternion, rigid_poses
 from raytac.sensor import TactileSensor
 from raytac.specs.task import COUPLINGS, TaskScene
@@ -326,17 +326,18 @@ class TactileWorld:
         """Present state of all environments."""
         now, lost = self._reader.values(), self._failed
         wrench = {name: self._pads.wrench(name) for name in self.sensor_names}
+        time = now.pop("time")
         if lost.any():
             for values in (*now.values(), *wrench.values()):
                 values[lost] = np.nan
         pads = {name: now[f"pad {name}"] for name in self.sensor_names}
         bodies = {name: now[f"body {name}"] for name in self.composed.bodies}
-        time = np.array([d.time for d in self.data])
         return WorldState(time, now.get("joints"), pads, bodies, wrench, lost.copy(), dict(self._pads.report))
 
     def _numbers(self) -> dict[str, Numbers]:
         """Numbers that ``state`` reads of every environment."""
-        read = {f"pad {m.name}": site_pose(int(self.model.site(m.site).id)) for m in self.composed.sensors}
+        read = {"time": numbers("time", np.array(0))}
+        read |= {f"pad {m.name}": site_pose(int(self.model.site(m.site).id)) for m in self.composed.sensors}
         read |= {f"body {name}": body_pose(body.index) for name, body in self.composed.bodies.items()}
         return read if self.arm is None else read | {"joints": self.arm.numbers()["joints"]}
 

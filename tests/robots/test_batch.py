@@ -56,17 +56,20 @@ def test_numbers_are_those_that_mujoco_has_now() -> None:
             "site": site_pose(site),
             "body": body_pose(body),
             "none": numbers("qpos", np.zeros(0)),
+            "time": numbers("time", np.array(0)),
         },
     )
     assert reader.reads(datas) and not reader.reads(datas[:2]) and not reader.reads([datas[0], datas[0], datas[2]])
     for _ in range(2):
         now = reader.values()
         np.testing.assert_array_equal(now["q"], [[[d.qpos[2], d.qpos[0]], [0.0, d.qpos[1]]] for d in datas])
+        np.testing.assert_array_equal(now["time"], [data.time for data in datas])
         np.testing.assert_array_equal(now["site"], site_poses(datas, site))
         np.testing.assert_array_equal(now["body"], body_poses(datas, body))
         assert now["none"].shape == (3, 0)
         for data in datas:
             mujoco.mj_step(arm.model, data)
+            data.time *= 1.1
     assert not np.array_equal(now["site"], reader.values()["site"]), "the states have moved"
     for wrong in (
         numbers("qpos", np.array([arm.model.nq])),
