@@ -129,27 +129,34 @@ def least_around(
     nx: wp.int32,
     ny: wp.int32,
     steep: wp.float64,
-) -> wp.float64:
-    """Lower bound of a convex gap [m] up to one node away from node k of a window, which is its i-th along x and its j-th along y.
+) -> wp.vec2d:
+    """Lower bound of a convex gap [m] up to one node away from node k of a window, its i-th along x and its j-th along y, and nodes
+    that the outline of the body may reach beyond it: 1 where a neighbour is beside the body, else 0.
 
     A convex function falls on one side of a node by no more than it rises on the other. ``steep``: fall [m] where both neighbours along
     an axis are missing.
     """
-    middle = gap[block, k]
-    result = wp.float64(middle)
+    middle, beyond = gap[block, k], wp.float64(0.0)
+    result = gap[block, k] + wp.float64(0.0)
     m = wp.int32(0)
     while m < 2:
         step, at, count = wp.where(m == 0, 1, nx), wp.where(m == 0, i, j), wp.where(m == 0, nx, ny)
         rise = -infinity()
-        if at > 0 and gap[block, k - step] < _INF:
-            rise = gap[block, k - step] - middle
-        if at < count - 1 and gap[block, k + step] < _INF:
-            rise = wp.max(rise, gap[block, k + step] - middle)
+        if at > 0:
+            if gap[block, k - step] < _INF:
+                rise = gap[block, k - step] - middle
+            else:
+                beyond = wp.float64(1.0)
+        if at < count - 1:
+            if gap[block, k + step] < _INF:
+                rise = wp.max(rise, gap[block, k + step] - middle)
+            else:
+                beyond = wp.float64(1.0)
         if rise == -_INF:
             rise = steep
         result -= wp.max(rise, _0)
         m += 1
-    return result
+    return wp.vec2d(result, beyond)
 
 
 @wp.func
@@ -164,12 +171,13 @@ def box_around(
     step_x: wp.float64,
     step_y: wp.float64,
 ) -> wp.vec4d:
-    """x from, to, y from, to [m] of nodes and one node's spacing around them."""
+    """x from, to, y from, to [m] of nodes, which may be beside the grid, and one node's spacing around them."""
+    x, y = pads.lines[fx][0], pads.lines[fy][0]
     return wp.vec4d(
-        pads.lines[fx + i0][0] - step_x,
-        pads.lines[fx + i1][0] + step_x,
-        pads.lines[fy + j0][0] - step_y,
-        pads.lines[fy + j1][0] + step_y,
+        x + wp.float64(i0 - 1) * step_x,
+        x + wp.float64(i1 + 1) * step_x,
+        y + wp.float64(j0 - 1) * step_y,
+        y + wp.float64(j1 + 1) * step_y,
     )
 
 

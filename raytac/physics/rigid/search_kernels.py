@@ -222,11 +222,16 @@ def measure_pair(
                     q += 1
                 if work.gap[block, k] < _INF:
                     around = least_around(work.gap, block, k, p, q, nx, n // nx, _NEAR * pitch)
-                    bound = wp.min(bound, around)
-                    if around <= counted:
-                        a0, a1, b0, b1 = wp.min(a0, i0 + p), wp.min(a1, -i0 - p), wp.min(b0, j0 + q), wp.min(b1, -j0 - q)
-                    if around <= floor or (count == 0 and around <= least):
-                        b = wp.vec4i(wp.min(b[0], i0 + p), wp.min(b[1], -i0 - p), wp.min(b[2], j0 + q), wp.min(b[3], -j0 - q))
+                    bound = wp.min(bound, around[0])
+                    # An outline may end in a tip that has no node on the next line.
+                    e = wp.int32(around[1])
+                    if around[0] <= counted:
+                        a0, a1 = wp.min(a0, i0 + p - e), wp.min(a1, -i0 - p - e)
+                        b0, b1 = wp.min(b0, j0 + q - e), wp.min(b1, -j0 - q - e)
+                    if around[0] <= floor or (count == 0 and around[0] <= least):
+                        b = wp.vec4i(
+                            wp.min(b[0], i0 + p - e), wp.min(b[1], -i0 - p - e), wp.min(b[2], j0 + q - e), wp.min(b[3], -j0 - q - e)
+                        )
                 p += lanes
                 k += lanes
             bound = least_of(bound)
@@ -260,7 +265,8 @@ def measure_pair(
                     following += 1
                     expected *= 4
                 if wide and (convex or width[1] == _INF) and a0 < _MANY:
-                    box = box_around(pads, fx, fy, a0, a1, b0, b1, step_x, step_y)
+                    e = wp.where(convex, 0, 1)  # a tip as above
+                    box = box_around(pads, fx, fy, a0 - e, a1 + e, b0 - e, b1 + e, step_x, step_y)
                     outer = wp.vec4d(box)
             level = following
             continue

@@ -342,3 +342,32 @@ def test_the_spread_is_that_of_a_punch_and_of_a_ball() -> None:
     np.testing.assert_allclose(ball.spread[0], [radius, 0.0, radius], rtol=0.15, atol=1e-9)
     pose[0, 2, 3] = 5e-3 + 20e-6
     np.testing.assert_array_equal(search_one(FLAT, [primitive("sphere", (radius,))], pose).spread, np.zeros((1, 3)))
+
+
+@pytest.mark.parametrize("gelpad", [DOME, FLAT], ids=["dome", "flat"])
+@pytest.mark.parametrize("kind", ["box", "cylinder", "plane"])
+def test_a_convex_body_is_measured_as_any_other(kind: str, gelpad: GelpadSpec) -> None:
+    """Where convexity bounds the search: as the same part given twice, which is searched without."""
+    rng = np.random.default_rng(3)
+    size = {"box": (15e-3, 6e-3, 5e-3), "cylinder": (6e-3, 5e-3), "plane": ()}[kind]
+    part, grid = primitive(kind, size), make_grid(gelpad, 0.1e-3)
+    poses = np.tile(np.eye(4), (80, 1, 1))
+    turned = rotations(np.array([[math.pi, 0.0, 0.0]]))[0] if kind == "plane" else np.eye(3)
+    tilt = 10.0 ** rng.uniform(-4.0, -0.7, (80, 1)) * rng.normal(size=(80, 3))
+    tilt[:, 2] = rng.uniform(-3.0, 3.0, 80)
+    poses[:, :3, :3] = rotations(tilt) @ turned
+    poses[:, :2, 3] = rng.uniform(-14e-3, 14e-3, (80, 2))
+    under = object_height([part], poses, grid.x, grid.y)
+    least = (under - grid.rest).min(axis=(1, 2))
+    poses, under, least = (v[np.isfinite(least)] for v in (poses, under, least))
+    shift = np.where(rng.random(len(poses)) < 0.3, -1.0, 1.0) * 10.0 ** rng.uniform(-5.0, -3.5, len(poses))
+    poses[:, 2, 3] -= least + shift
+    one, two = (search_one(gelpad, parts, poses, reach=0.2e-3) for parts in ([part], [part, part]))
+    np.testing.assert_array_equal(one.env, two.env)
+    assert (one.depth < 0.0).sum() > 5 and (one.depth > 0.0).sum() > 30
+    for name in ("depth", "centre", "normal", "spread", "deepest"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name), err_msg=name)
+    for name in ("force", "radius"):  # the node after the last that counts may be out of the box
+        np.testing.assert_allclose(getattr(one, name), getattr(two, name), rtol=2e-3, atol=1e-12, err_msg=name)
+    lowest = (under - (least + shift)[:, None, None]).min(axis=(1, 2))[one.env]
+    np.testing.assert_allclose(one.clearance, gelpad.thickness + lowest, atol=60e-6)
