@@ -22,6 +22,8 @@ from raytac.shapes.primitives import bounds
 from raytac.shapes.underside import object_radius
 from raytac.specs.sensor import GelpadSpec
 
+_AHEAD = 0.05
+"""Share of the gel's thickness by which a step may go deeper on a load law that is tabulated: twice what fast bodies may (``longest``)."""
 _SHORTEST = 1e-6
 """Steps are not shorter than this, or half of it [s]."""
 
@@ -91,7 +93,8 @@ class GelContact:
         self.device = wp.get_device(device)
         pads, count = len(gels), len(bodies.parts)
         self.ticks = 2 ** max(int(np.ceil(np.log2(timestep / _SHORTEST))), 0)
-        self.search = PadSearch(gels, bodies.parts, num_envs=num_envs, device=device)
+        ahead = _AHEAD * min((gel.thickness for gel in gels), default=0.0)
+        self.search = PadSearch(gels, bodies.parts, num_envs=num_envs, ahead=ahead, device=device)
         self._gels, self._touched = _gels(gels, bodies, self.device), _touched(bodies, self.device)
         self._numbers: Any = world.Differences()
         for name, values in numbers.items():

@@ -46,9 +46,12 @@ class Bins:
 
 
 @wp.func
-def deepest_of(depth: wp.float64, reach: wp.float64, thickness: wp.float64) -> wp.float64:
-    """Depth [m] up to which the law is tabulated: what a body may reach, up to the thickness, so that the present one is in the table."""
-    deepest = wp.max(DEEPER * depth, depth + reach)
+def deepest_of(depth: wp.float64, reach: wp.float64, ahead: wp.float64, thickness: wp.float64) -> wp.float64:
+    """Depth [m] up to which the law is tabulated: what a body may reach, but no more than ``ahead`` into the gel or deeper than it is.
+
+    It is chosen so that the present depth is one of the table's own, and the gel's thickness at most.
+    """
+    deepest = wp.max(DEEPER * depth, wp.min(depth + reach, wp.max(depth, _0) + ahead))
     if depth > _0 and deepest < thickness:
         k = wp.floor(_STEPS * wp.sqrt(depth / deepest) + wp.float64(1e-9))
         if k >= wp.float64(6.0):

@@ -38,9 +38,23 @@ class PadSearch:
     """
 
     def __init__(
-        self, gelpads: Sequence[GelpadSpec], bodies: Sequence[Sequence[Part]], *, num_envs: int, device: str = "cpu"
+        self,
+        gelpads: Sequence[GelpadSpec],
+        bodies: Sequence[Sequence[Part]],
+        *,
+        num_envs: int,
+        ahead: float = np.inf,
+        device: str = "cpu",
     ) -> None:
-        """Bodies by their parts, body frame; ``device``: "cpu" or "cuda"."""
+        """Make memory on the device.
+
+        Args:
+            gelpads: the pads.
+            bodies: parts of each body, body frame.
+            num_envs: number of environments.
+            ahead: how far into the gel, beyond the present depth, laws are tabulated at most [m]; a law goes on straight from there.
+            device: "cpu" or "cuda".
+        """
         start_warp()
         self.device = wp.get_device(device)
         self._pads = PadArrays(gelpads, PITCHES, LAST, self.device)
@@ -48,6 +62,7 @@ class PadSearch:
         self._shape = len(gelpads), len(bodies)
         self._capacity = 0
         self._work = self._memory(num_envs)
+        self._work.ahead = ahead
         self._allocate(num_envs)
         self.reserve(self._pairs if self.device.is_cuda else 1)
 

@@ -72,6 +72,8 @@ class Work:
     bins: Bins
     gap: wp.array2d(dtype=wp.float64)
     """Gaps of a window's nodes [m], (blocks, most nodes)."""
+    ahead: wp.float64
+    """See ``PadSearch``."""
 
 
 @wp.kernel
@@ -213,7 +215,11 @@ def measure_pair(
             b = wp.vec4i(_MANY, _MANY, _MANY, _MANY)
             a0, a1, b0, b1 = wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY)
             bound, floor = infinity(), wp.min(least, _0)
-            counted = wp.max(deeper, _HALF * (reach + least))
+            counted = wp.float64(0.0)
+            if least < _0:
+                counted = wp.max(deeper, _HALF * (wp.min(reach, work.ahead) + least))
+            else:
+                counted = wp.max(deeper, wp.min(_HALF * (reach + least), _HALF * work.ahead + least))
             p, q = wp.int32(lane), wp.int32(0)
             k = wp.int32(lane)
             while k < n:
@@ -286,7 +292,7 @@ def measure_pair(
         depth = drop[0] - least
         refined_x = pads.lines[fx + i][0] + drop[1] * step_x
         refined_y = pads.lines[fy + j][0] + drop[2] * step_y
-        deepest = deepest_of(depth, reach, thickness)
+        deepest = deepest_of(depth, reach, work.ahead, thickness)
         if least < _0:
             touching = 1
             level += 1  # as after the law's nodes
