@@ -16,6 +16,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _TORUS = wp.constant(wp.int32(7))
 """First of the kinds of parts that may not be convex."""
+NOWHERE = wp.constant(wp.int32(0x3FFFFFFF))
 _0 = wp.constant(wp.float64(0.0))
 _2 = wp.constant(wp.float64(2.0))
 _HALF = wp.constant(wp.float64(0.5))
@@ -121,63 +122,78 @@ def between_nodes(
 
 @wp.func
 def least_around(
-    gap: wp.array2d(dtype=wp.float64),
-    block: wp.int32,
-    k: wp.int32,
-    i: wp.int32,
-    j: wp.int32,
-    nx: wp.int32,
-    ny: wp.int32,
+    gap: wp.array2d(dtype=wp.float64), block: wp.int32, k: wp.int32, i: wp.int32, j: wp.int32, nx: wp.int32, ny: wp.int32,
     steep: wp.float64,
-) -> wp.vec2d:
-    """Lower bound of a convex gap [m] up to one node away from node k of a window, its i-th along x and its j-th along y, and nodes
-    that the outline of the body may reach beyond it: 1 where a neighbour is beside the body, else 0.
+) -> wp.vec2d:  # fmt: skip
+    """Lower bound of a convex gap [m] around node k of a window, its i-th along x and its j-th along y; and for how many half spacings
+    around it holds: 1, 2 of a node at the outline of body or window, 4 where a neighbour is beside the body, whose outline may end in a
+    tip that has no node on the next line.
 
     A convex function falls on one side of a node by no more than it rises on the other. ``steep``: fall [m] where both neighbours along
     an axis are missing.
     """
-    middle, beyond = gap[block, k], wp.float64(0.0)
-    result = gap[block, k] + wp.float64(0.0)
+    middle, fall, around = gap[block, k] + wp.float64(0.0), wp.float64(0.0), wp.float64(1.0)
     m = wp.int32(0)
     while m < 2:
         step, at, count = wp.where(m == 0, 1, nx), wp.where(m == 0, i, j), wp.where(m == 0, nx, ny)
         rise = -infinity()
+        if at < 2 or at >= count - 2 or gap[block, k - 2 * step] == _INF or gap[block, k + 2 * step] == _INF:
+            around = wp.max(around, _2)
         if at > 0:
             if gap[block, k - step] < _INF:
                 rise = gap[block, k - step] - middle
             else:
-                beyond = wp.float64(1.0)
+                around = wp.float64(4.0)
         if at < count - 1:
             if gap[block, k + step] < _INF:
                 rise = wp.max(rise, gap[block, k + step] - middle)
             else:
-                beyond = wp.float64(1.0)
+                around = wp.float64(4.0)
         if rise == -_INF:
             rise = steep
-        result -= wp.max(rise, _0)
+        fall += wp.max(rise, _0)
         m += 1
-    return wp.vec2d(result, beyond)
+    return wp.vec2d(middle - _HALF * wp.min(around, _2) * fall, around)
+
+
+@wp.func
+def nodes_below(
+    gap: wp.array2d(dtype=wp.float64), block: wp.int32, lane: wp.int32, lanes: wp.int32, n: wp.int32, nx: wp.int32, below: wp.float64,
+    steep: wp.float64,
+):  # fmt: skip
+    """Least bound of ``least_around``, and where in a window of n nodes, rows of ``nx``, a convex gap may be at ``below`` or lower [m]:
+    x from, to, y from, to in half spacings from the window's first node; the first is ``NOWHERE`` if it is nowhere."""
+    least = infinity()
+    x0, x1, y0, y1 = wp.int32(NOWHERE), wp.int32(NOWHERE), wp.int32(NOWHERE), wp.int32(NOWHERE)
+    i, j = wp.int32(lane), wp.int32(0)
+    k = wp.int32(lane)
+    while k < n:
+        while i >= nx:
+            i -= nx
+            j += 1
+        if gap[block, k] < _INF:
+            bound = least_around(gap, block, k, i, j, nx, n // nx, steep)
+            least = wp.min(least, bound[0])
+            if bound[0] <= below:
+                around = wp.int32(bound[1]) + 1  # so that the law knows the node after the last that counts
+                x0, x1 = wp.min(x0, 2 * i - around), wp.min(x1, -2 * i - around)
+                y0, y1 = wp.min(y0, 2 * j - around), wp.min(y1, -2 * j - around)
+        i += lanes
+        k += lanes
+    return least_of(least), wp.vec4i(first_of(x0), -first_of(x1), first_of(y0), -first_of(y1))
 
 
 @wp.func
 def box_around(
-    pads: Pads,
-    fx: wp.int32,
-    fy: wp.int32,
-    i0: wp.int32,
-    i1: wp.int32,
-    j0: wp.int32,
-    j1: wp.int32,
-    step_x: wp.float64,
-    step_y: wp.float64,
+    pads: Pads, fx: wp.int32, fy: wp.int32, i0: wp.int32, j0: wp.int32, halves: wp.vec4i, step_x: wp.float64, step_y: wp.float64
 ) -> wp.vec4d:
-    """x from, to, y from, to [m] of nodes, which may be beside the grid, and one node's spacing around them."""
-    x, y = pads.lines[fx][0], pads.lines[fy][0]
+    """x from, to, y from, to [m] of half spacings from node ``i0``, ``j0`` of a grid."""
+    x, y = pads.lines[fx][0] + wp.float64(i0) * step_x, pads.lines[fy][0] + wp.float64(j0) * step_y
     return wp.vec4d(
-        x + wp.float64(i0 - 1) * step_x,
-        x + wp.float64(i1 + 1) * step_x,
-        y + wp.float64(j0 - 1) * step_y,
-        y + wp.float64(j1 + 1) * step_y,
+        x + _HALF * wp.float64(halves[0]) * step_x,
+        x + _HALF * wp.float64(halves[1]) * step_x,
+        y + _HALF * wp.float64(halves[2]) * step_y,
+        y + _HALF * wp.float64(halves[3]) * step_y,
     )
 
 

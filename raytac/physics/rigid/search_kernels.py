@@ -16,13 +16,14 @@ import warp as wp
 from raytac.physics.rigid.contact_rows import LAST, Rows, missing_row, place_of_gap
 from raytac.physics.rigid.law_kernels import DEEPER, Bins, add_node, clear_bins, deepest_of, tabulate
 from raytac.physics.rigid.node_kernels import (
+    NOWHERE,
     between_nodes,
     box_around,
     count_of,
     first_of,
     is_convex,
-    least_around,
     least_of,
+    nodes_below,
     pierced_at,
     total_of,
 )
@@ -52,6 +53,8 @@ _FIRST, _LAST = wp.constant(wp.int32(1)), wp.constant(wp.int32(LAST))
 _FINEST = wp.constant(wp.int32(len(PITCHES) - 1))
 _NEAR = wp.constant(wp.float64(0.75))
 """Between nodes that all stay this share of the spacing from the gel a body does not touch: a cone of 45° would reach 0.71 further."""
+_CLOSE = wp.constant(wp.float64(1e-6))
+"""A least gap is near enough to its lower bound with this [m]: parabolas between the nodes come nearer by far."""
 _JUST_TOUCHING = wp.constant(wp.float64(50e-6))
 """The place of a gap is the centroid of the overlap that the body would have so much deeper [m]."""
 _0 = wp.constant(wp.float64(0.0))
@@ -192,6 +195,9 @@ def measure_pair(
         if mode == _LAW:
             if (count >= _ENOUGH and level >= _FIRST) or level >= last:
                 busy = 0
+            elif convex and count > 0:
+                bound, halves = nodes_below(work.gap, block, lane, lanes, n, nx, zero, _NEAR * pitch)
+                box = box_around(pads, fx, fy, i0, j0, halves, step_x, step_y)
             level += 1
             continue
         least = least_of(own_least)
@@ -211,50 +217,28 @@ def measure_pair(
         done = level >= last or (count >= _ENOUGH and level >= _FIRST)
         beyond = wp.bool(False)
         if not done and wide and convex:
-            # Nodes around which the gap may be below what the law counts, and those around which it may be least.
-            b = wp.vec4i(_MANY, _MANY, _MANY, _MANY)
-            a0, a1, b0, b1 = wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY)
-            bound, floor = infinity(), wp.min(least, _0)
+            # Where the gap may be below what the law counts, and where it may be least.
             counted = wp.float64(0.0)
             if least < _0:
                 counted = wp.max(deeper, _HALF * (wp.min(reach, work.ahead) + least))
             else:
                 counted = wp.max(deeper, wp.min(_HALF * (reach + least), _HALF * work.ahead + least))
-            p, q = wp.int32(lane), wp.int32(0)
-            k = wp.int32(lane)
-            while k < n:
-                while p >= nx:
-                    p -= nx
-                    q += 1
-                if work.gap[block, k] < _INF:
-                    around = least_around(work.gap, block, k, p, q, nx, n // nx, _NEAR * pitch)
-                    bound = wp.min(bound, around[0])
-                    # An outline may end in a tip that has no node on the next line.
-                    e = wp.int32(around[1])
-                    if around[0] <= counted:
-                        a0, a1 = wp.min(a0, i0 + p - e), wp.min(a1, -i0 - p - e)
-                        b0, b1 = wp.min(b0, j0 + q - e), wp.min(b1, -j0 - q - e)
-                    if around[0] <= floor or (count == 0 and around[0] <= least):
-                        b = wp.vec4i(
-                            wp.min(b[0], i0 + p - e), wp.min(b[1], -i0 - p - e), wp.min(b[2], j0 + q - e), wp.min(b[3], -j0 - q - e)
-                        )
-                p += lanes
-                k += lanes
-            bound = least_of(bound)
-            a0, a1, b0, b1 = first_of(a0), -first_of(a1), first_of(b0), -first_of(b1)
+            bound, halves = nodes_below(work.gap, block, lane, lanes, n, nx, counted, _NEAR * pitch)
+            if halves[0] < NOWHERE and mode == _SEARCH:
+                outer = box_around(pads, fx, fy, i0, j0, halves, step_x, step_y)
+                box = wp.vec4d(outer)
             beyond = bound >= reach and count == 0
-            done = beyond
+            done = beyond or (level >= _FIRST and count == 0 and least - bound < _CLOSE)
             if not done and count == 0 and may_zoom == 1:
-                if mode == _SEARCH and a0 < _MANY:
-                    outer = box_around(pads, fx, fy, a0, a1, b0, b1, step_x, step_y)
                 mode = wp.int32(_ZOOM)
-                box = box_around(pads, fx, fy, first_of(b[0]), -first_of(b[1]), first_of(b[2]), -first_of(b[3]), step_x, step_y)
+                bound, halves = nodes_below(work.gap, block, lane, lanes, n, nx, least, _NEAR * pitch)
+                box = box_around(pads, fx, fy, i0, j0, halves, step_x, step_y)
         elif not done and wide and least >= near:
             beyond = least >= reach + near
             done = beyond
             if not done and may_zoom == 1:
                 mode = wp.int32(_ZOOM)
-                box = box_around(pads, fx, fy, i, i, j, j, step_x, step_y)
+                box = box_around(pads, fx, fy, i, j, wp.vec4i(-2, 2, -2, 2), step_x, step_y)
         if not done:
             following = level + 1
             if low < _INF:
@@ -270,9 +254,9 @@ def measure_pair(
                 while following < wp.min(last, _LAST) and expected < _ENOUGH // 2:
                     following += 1
                     expected *= 4
-                if wide and (convex or width[1] == _INF) and a0 < _MANY:
-                    e = wp.where(convex, 0, 1)  # a tip as above
-                    box = box_around(pads, fx, fy, a0 - e, a1 + e, b0 - e, b1 + e, step_x, step_y)
+                if wide and not convex and width[1] == _INF and a0 < _MANY:
+                    # Two nodes more: an outline may end in a tip that has no node on the next line.
+                    box = box_around(pads, fx, fy, a0, b0, wp.vec4i(-4, 2 * (a1 - a0) + 4, -4, 2 * (b1 - b0) + 4), step_x, step_y)
                     outer = wp.vec4d(box)
             level = following
             continue
