@@ -72,7 +72,7 @@ def sheared(displacement: np.ndarray, over_gel: np.ndarray, radius: float, slack
         centre = np.array([[*place, 0.0]])
         state.begin(ROW, np.array([[STIFFNESS, STIFFNESS * radius**2]]), centre)
         state.move(ROW, np.array([[*step, 0.0]]), limit, centre, np.array([radius]))
-        result.append(state.stretch[ROW][0, :, :2].mean(axis=0))
+        result.append(state.mean[ROW][0, :2].copy())
     return np.array(result)
 
 
@@ -218,10 +218,10 @@ def test_reset_forgets_the_shear_and_a_batch_shears_as_its_environments_alone() 
     for _ in range(15):
         both.step()
     pads = both._pads
-    assert isinstance(pads, RigidPads) and pads._shear.stretch[:, 0, 0, :, 0].min() > 1e-6
+    assert isinstance(pads, RigidPads) and pads._shear.mean[:, 0, 0, 0].min() > 1e-6
     grid = make_grid(both.composed.sensor_specs[0].gelpad, 0.4e-3)
     shear = pads.reading("sensor", grid, both.data, np.array([False, True])).shear
-    assert shear is not None and shear.stretch[0, 0] == pytest.approx(pads._shear.stretch[0, 0, 0, :, 0].mean())
+    assert shear is not None and shear.stretch[0, 0] == pytest.approx(pads._shear.mean[0, 0, 0, 0])
     assert 0.0 < shear.stuck[0] < 1.0 and np.isnan(shear.stretch[1]).all() and np.isnan(shear.spin[1])
     both.reset([0])
     alone = cube_on(0.8)
@@ -245,7 +245,7 @@ def test_a_drag_that_reverses_slips_back_after_twice_the_stretch() -> None:
     def slip() -> float:
         """Tangential force of the stretch over that at which the contact slips."""
         shear = pads._shear
-        return shear.stretch[0, 0, 0, :, 0].mean() * shear.stiffness[0, 0, 0, 0] / shear.load[0, 0, 0, 0]
+        return shear.mean[0, 0, 0, 0] * shear.stiffness[0, 0, 0, 0] / shear.load[0, 0, 0, 0]
 
     assert slip() == pytest.approx(1.0, abs=0.02)
     world.model.opt.gravity[0] *= -1.0

@@ -17,18 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-ELEMENTS = 8
-"""Elements in parallel of every contact, all of one stiffness."""
-
-
-def element_limits(count: int = ELEMENTS) -> np.ndarray:
-    """Displacements over u₀ at which the elements slip, (count,).
-
-    The slope of the curve, √(1 − u/u₀), is the share of the stiffness that still sticks; the elements' strengths add up to μN.
-    """
-    stuck = 1.0 - (np.arange(count) + 0.5) / count
-    limits = 1.0 - stuck**2
-    return limits * (2.0 / 3.0) / limits.mean()
+MOST_RINGS = 16
+"""Rings of a contact at most, all of one shear stiffness but the outermost. It has at least three eighths as many."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import warp as wp
 
 from raytac.physics.rigid.contacts import LoadTables, PadContacts
 from raytac.physics.rigid.gel_contact import Bodies, GelContact
+from raytac.physics.rigid.shear import MOST_RINGS
 from raytac.se3 import rotations
 from raytac.shapes.part import primitive
 from raytac.specs import load_sensor
@@ -78,9 +79,17 @@ def random_state(seed: int, num_envs: int = ENVS) -> State:
     }
     numbers["inverse_weight"][:, [2, 6]] = 0.0  # the second pad and the last body do not move
     slots, there = (num_envs, PADS, COUNT + PADS), rng.random((num_envs, PADS, COUNT + PADS, 1)) < 0.5
+    stiffness = np.where(there, rng.uniform(0.5, 1.5, (*slots, 2)) * [2e3, 0.05], 0.0)
+    size = rng.uniform(6.0, 16.0, slots)
+    covered = np.clip(size[..., None] - np.arange(MOST_RINGS), 0.0, 1.0)
+    inner = covered * rng.choice([0.0, 0.3, 1.0], covered.shape)
+    parts = there & (np.stack([inner, covered - inner], axis=-1).reshape(*slots, -1) > 0.0)
     shear = {
-        "stretch": np.where(there[..., None], rng.normal(0.0, [1e-4, 1e-4, 0.02], (*slots, 8, 3)), 0.0),
-        "stiffness": np.where(there, rng.uniform(0.5, 1.5, (*slots, 2)) * [2e3, 0.05], 0.0),
+        "stretch": np.where(parts[..., None], rng.normal(0.0, [1e-4, 1e-4, 0.02], (*parts.shape, 3)), 0.0),
+        "inner": np.where(there, inner, 0.0),
+        "width": stiffness[..., 0] / size,
+        "mean": np.where(there, rng.normal(0.0, [1e-4, 1e-4, 0.02], (*slots, 3)), 0.0),
+        "stiffness": stiffness,
         "load": np.where(there, rng.uniform(0.5, 1.5, (*slots, 2)), 0.0),
         "centre": np.where(there, rng.normal(0.0, 2e-3, (*slots, 3)), 0.0),
         "play": np.where(there[..., None], rng.normal(0.0, 2e-4, (*slots, 2, 2)), 0.0),
@@ -320,7 +329,7 @@ def results(contact: GelContact, num_envs: int) -> dict[str, np.ndarray]:
     contact.end(num_envs)
     held = of_slots(contact, "held").astype(bool)
     result = {name: of_slots(contact, name) * held[..., None] for name in ("place", "friction", "force", "regularisation")}
-    result |= {name: getattr(contact.shear.struct, name).numpy() for name in ("stretch", "stiffness", "load", "play")}
+    result |= {name: getattr(contact.shear.struct, name).numpy() for name in ("stretch", "inner", "width", "mean", "stiffness", "load", "play")}
     return result | {"wrench": contact.wrenches.numpy(), "length": contact.steps.length.numpy(), "held": held}
 
 
