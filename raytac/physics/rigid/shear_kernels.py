@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.physics.rigid.shear import MOST_RINGS
+from raytac.physics.rigid.shear import LEAST_RINGS, MOST_RINGS
 from raytac.physics.rigid.world_kernels import Shear
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _RINGS = wp.constant(wp.int32(MOST_RINGS))
 _MOST = wp.constant(wp.float64(MOST_RINGS))
-_LEAST = wp.constant(wp.float64(0.375 * MOST_RINGS))
-"""A contact of fewer rings halves their width, one of more than ``_MOST`` doubles it. Between both it may vibrate without either."""
+_LEAST = wp.constant(wp.float64(LEAST_RINGS))
+"""Between both a contact may vibrate while its rings keep their width: the load by a factor of 2.4."""
 _FRESH = wp.constant(wp.float64(0.01))
 """Square of the stretch of the outer part of a ring over the inner one's, from which both join."""
 _PLAY = wp.constant(wp.float64(0.125))
@@ -166,6 +166,18 @@ def halve_width(shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, size
 
 
 @wp.func
+def halve_whole(shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, k: wp.int32):
+    """Let both halves of a ring slip by themselves, if one part is all of it."""
+    inner = shear.inner[env, pad, body, k]
+    if inner <= _0:
+        shear.stretch[env, pad, body, 2 * k] = shear.stretch[env, pad, body, 2 * k + 1]
+        shear.inner[env, pad, body, k] = _HALF
+    elif inner >= _1:
+        shear.stretch[env, pad, body, 2 * k + 1] = shear.stretch[env, pad, body, 2 * k]
+        shear.inner[env, pad, body, k] = _HALF
+
+
+@wp.func
 def move_shear(
     shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, displacement: wp.vec3d, limit: wp.vec2d, centre: wp.vec3d,
     radius: wp.float64,
@@ -185,13 +197,17 @@ def move_shear(
     k = wp.int32(0)
     while wp.float64(k) < size:
         low = wp.float64(k)
+        if low + _1 <= size:  # not the outermost: where the load vibrates, its halves would join and slip in every cycle
+            halve_whole(shear, env, pad, body, k)
         edge, high = low + shear.inner[env, pad, body, k], wp.min(low + _1, size)
         if edge > low:
             stretch = kept * slipped(shear.stretch[env, pad, body, 2 * k] + displacement, along, about, low / size, edge / size)
             shear.stretch[env, pad, body, 2 * k] = stretch
             total += wp.cw_mul(weight(low, edge), stretch)
         if high > edge:
-            stretch = kept * slipped(shear.stretch[env, pad, body, 2 * k + 1] + displacement, along, about, edge / size, high / size)
+            stretch = kept * slipped(
+                shear.stretch[env, pad, body, 2 * k + 1] + displacement, along, about, edge / size, high / size
+            )
             shear.stretch[env, pad, body, 2 * k + 1] = stretch
             total += wp.cw_mul(weight(edge, high), stretch)
         k += 1

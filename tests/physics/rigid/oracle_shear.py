@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from raytac.physics.rigid.shear import MOST_RINGS
+from raytac.physics.rigid.shear import LEAST_RINGS, MOST_RINGS
 
 _PLAY = 0.125
 """Share of the contact's radius that its centre may go to and fro over gel and body without rolling: the centroid of nodes jitters."""
@@ -54,7 +54,7 @@ class ShearOracle:
                 parts = _Parts.of(self, row, before)
                 if after < before:
                     parts.shrink(after)
-                    while after / parts.width < 0.375 * MOST_RINGS:
+                    while after / parts.width < LEAST_RINGS:
                         parts = parts.halved()
                 else:
                     while after / parts.width > MOST_RINGS:
@@ -77,8 +77,9 @@ class ShearOracle:
         kept = np.exp(-self._rolled(rows, centre, radius) / (2.0 * radius))
         for k, row in enumerate(zip(*rows, strict=True)):
             parts = _Parts.of(self, row, self.stiffness[row][0])
+            parts.halve_whole()
             parts.slip(displacement[k], limit[k] / np.maximum(self.stiffness[row], 1e-30), kept[k])
-            self.stretch[row], self.mean[row] = parts.stretch.reshape(-1, 3), parts.mean()
+            self.stretch[row], self.inner[row], self.mean[row] = parts.stretch.reshape(-1, 3), parts.inner, parts.mean()
         self.load[rows], self.centre[rows] = limit, centre
         self.moved[rows] = displacement[:, :2]
 
@@ -169,6 +170,12 @@ class _Parts:
         stretch[1::2][half <= 1.0, 0] = 0.0
         stretch[np.arange(MOST_RINGS) >= 2.0 * self.size] = 0.0
         return _Parts(stretch, inner, 0.5 * self.width, self.size * self.width)
+
+    def halve_whole(self) -> None:
+        whole = (np.arange(MOST_RINGS) + 1.0 <= self.size) & ((self.inner <= 0.0) | (self.inner >= 1.0))
+        for k in np.flatnonzero(whole):
+            self.stretch[k] = self.stretch[k, 1 if self.inner[k] <= 0.0 else 0]
+            self.inner[k] = 0.5
 
     def slip(self, displacement: np.ndarray, limit: np.ndarray, kept: float) -> None:
         """``limit`` (2,): force and torque of slip over the stiffness."""
