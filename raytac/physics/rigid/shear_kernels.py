@@ -48,7 +48,7 @@ def begin_shear(shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, stif
                 halve_width(shear, env, pad, body, size)
         elif stiffness[0] > before[0]:
             old = before[0] / width
-            while size > _MOST:
+            while size > _MOST and width < stiffness[0]:
                 double_width(shear, env, pad, body, old)
                 width *= _2
                 size *= _HALF
@@ -62,7 +62,7 @@ def begin_shear(shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, stif
     size = stiffness[0] / shear.width[env, pad, body]
     total = wp.vec3d()
     k = wp.int32(0)
-    while wp.float64(k) < size:
+    while k < _RINGS and wp.float64(k) < size:
         low = wp.float64(k)
         edge, high = low + shear.inner[env, pad, body, k], wp.min(low + _1, size)
         total += wp.cw_mul(weight(low, edge), shear.stretch[env, pad, body, 2 * k])
@@ -195,7 +195,7 @@ def move_shear(
     size = stiffness[0] / shear.width[env, pad, body]
     total = wp.vec3d()
     k = wp.int32(0)
-    while wp.float64(k) < size:
+    while k < _RINGS and wp.float64(k) < size:
         low = wp.float64(k)
         if low + _1 <= size:  # not the outermost: where the load vibrates, its halves would join and slip in every cycle
             halve_whole(shear, env, pad, body, k)
