@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from raytac.physics.rigid.shear import ELEMENTS, ContactShear
+from raytac.physics.rigid.shear import MOST_RINGS, ContactShear
 from raytac.physics.rigid.world_kernels import Shear
 
 
@@ -16,7 +16,11 @@ class ShearState:
     kernels'; on CUDA only ``struct`` is kept up to date.
 
     Attributes:
-        stretch: displacement [m] along two tangents and rotation [rad] about the normal, of every element, (…, ELEMENTS, 3).
+        stretch: displacement [m] along two tangents and rotation [rad] about the normal, of both parts of every ring, from the middle
+            outwards, (…, 2 MOST_RINGS, 3); 0 beyond the contact.
+        inner: width of the inner part of every ring over the ring's, (…, MOST_RINGS).
+        width: shear stiffness of a ring [N/m], (…).
+        mean: of ``stretch`` by stiffness, (…, 3).
         stiffness: shear and twist stiffness at the last step [N/m, N m/rad], (…, 2); 0 out of contact.
         load: tangential force and torque at which the contact slips [N, N m], (…, 2).
         centre: of the contact [m], (…, 3).
@@ -32,6 +36,9 @@ class ShearState:
             setattr(struct, name, wp.zeros((*shape, *inner), dtype=dtype, device=device))
         self.struct = struct
         self.stretch: np.ndarray = struct.stretch.numpy()
+        self.inner: np.ndarray = struct.inner.numpy()
+        self.width: np.ndarray = struct.width.numpy()
+        self.mean: np.ndarray = struct.mean.numpy()
         self.stiffness: np.ndarray = struct.stiffness.numpy()
         self.load: np.ndarray = struct.load.numpy()
         self.centre: np.ndarray = struct.centre.numpy()
@@ -47,7 +54,7 @@ class ShearState:
         """Shear of one contact of each environment; body −1 is none."""
         rows = envs, np.full(len(envs), pad), np.maximum(body, 0)
         touched = (body >= 0) & (self.load[rows][:, 0] > 0.0)
-        mean = np.where(touched[:, None], self.stretch[rows].mean(axis=1), 0.0)
+        mean = np.where(touched[:, None], self.mean[rows], 0.0)
         force = np.linalg.norm(mean[:, :2], axis=1) * self.stiffness[rows][:, 0]
         share = np.minimum(force / np.where(touched, self.load[rows][:, 0], 1.0), 1.0)
         stuck = np.where(touched, np.cbrt(1.0 - share), 0.0)
@@ -55,7 +62,10 @@ class ShearState:
 
 
 _ARRAYS: dict[str, tuple[tuple[int, ...], Any]] = {
-    "stretch": ((ELEMENTS,), wp.vec3d),
+    "stretch": ((2 * MOST_RINGS,), wp.vec3d),
+    "inner": ((MOST_RINGS,), wp.float64),
+    "width": ((), wp.float64),
+    "mean": ((), wp.vec3d),
     "stiffness": ((), wp.vec2d),
     "load": ((), wp.vec2d),
     "centre": ((), wp.vec3d),

@@ -154,6 +154,9 @@ class Shear:
     """State of the shear of all contacts, (B, pads, bodies + pads); see ``ShearState``."""
 
     stretch: wp.array4d(dtype=wp.vec3d)
+    inner: wp.array4d(dtype=wp.float64)
+    width: wp.array3d(dtype=wp.float64)
+    mean: wp.array3d(dtype=wp.vec3d)
     stiffness: wp.array3d(dtype=wp.vec2d)
     load: wp.array3d(dtype=wp.vec2d)
     centre: wp.array3d(dtype=wp.vec3d)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from raytac.physics.rigid.shear import ELEMENTS, element_limits
+from raytac.physics.rigid.shear import LEAST_RINGS, MOST_RINGS
 
-_LIMITS = element_limits()
 _PLAY = 0.125
 """Share of the contact's radius that its centre may go to and fro over gel and body without rolling: the centroid of nodes jitters."""
 
@@ -16,8 +15,14 @@ class ShearOracle:
 
     def __init__(self, num_envs: int, pads: int, bodies: int) -> None:
         shape = num_envs, pads, bodies
-        self.stretch = np.zeros((*shape, ELEMENTS, 3))
-        """Displacement [m] along two tangents and rotation [rad] about the normal, of every element."""
+        self.stretch = np.zeros((*shape, 2 * MOST_RINGS, 3))
+        """Displacement [m] along two tangents and rotation [rad] about the normal, of both parts of every ring."""
+        self.inner = np.zeros((*shape, MOST_RINGS))
+        """Width of the inner part of every ring over the ring's."""
+        self.width = np.zeros(shape)
+        """Shear stiffness of a ring [N/m]."""
+        self.mean = np.zeros((*shape, 3))
+        """Of the stretch by stiffness."""
         self.stiffness = np.zeros((*shape, 2))
         """Shear and twist stiffness at the last step [N/m, N m/rad]; 0 out of contact."""
         self.load = np.zeros((*shape, 2))
@@ -38,30 +43,44 @@ class ShearOracle:
 
         ``centre`` (n, 3) [m] is where new ones start.
 
-        A contact that has grown since keeps its force, since new area comes without stress; one that has shrunk keeps its stretch.
+        What a contact has grown by is without stretch; what it has shrunk by leaves with its own.
         """
-        before = self.stiffness[rows]
-        self.centre[rows] = np.where(before[:, :1] > 0.0, self.centre[rows], centre)
-        kept = np.minimum(before / stiffness, 1.0)[:, [0, 0, 1]]
-        self.stretch[rows] *= kept[:, None]
+        mean = np.empty((len(stiffness), 3))
+        for k, row in enumerate(zip(*rows, strict=True)):
+            before, after = self.stiffness[row][0], stiffness[k, 0]
+            if not before > 0.0:
+                self.centre[row], self.width[row] = centre[k], 2.0 * after / MOST_RINGS
+            elif before != after:
+                parts = _Parts.of(self, row, before)
+                if after < before:
+                    parts.shrink(after)
+                    while after / parts.width < LEAST_RINGS:
+                        parts = parts.halved()
+                else:
+                    while after / parts.width > MOST_RINGS:
+                        parts = parts.doubled()
+                    parts.grow(after, stiffness[k, 1] / after)
+                self.stretch[row], self.inner[row], self.width[row] = parts.stretch.reshape(-1, 3), parts.inner, parts.width
+            mean[k] = _Parts.of(self, row, after).mean()
         self.stiffness[rows] = stiffness
-        return stiffness[:, [0, 0, 1]] * self.stretch[rows].mean(axis=1)
+        return stiffness[:, [0, 0, 1]] * mean
 
     def move(
         self, rows: tuple[np.ndarray, ...], displacement: np.ndarray, limit: np.ndarray, centre: np.ndarray, radius: np.ndarray
     ) -> None:
-        """Add a step's displacement (n, 3) and let elements slip.
+        """Add a step's displacement (n, 3) and let rings slip.
 
         ``limit`` (n, 2): force and torque of slip [N, N m] at the load of the step; ``centre`` (n, 3) of the contact at the start of the
         step and its ``radius`` (n,) [m]. Gel that leaves the contact as it rolls on takes its stretch with it: over the contact's diameter.
         """
-        stretch = self.stretch[rows] + displacement[:, None]
-        largest = 1.5 * limit / np.maximum(self.stiffness[rows], 1e-30)
-        part = stretch / np.maximum(largest[:, None, [0, 0, 1]] * _LIMITS[None, :, None], 1e-30)
-        stretch /= np.maximum(np.sqrt(np.vecdot(part, part)), 1.0)[..., None]
         radius = np.maximum(radius, 0.5e-9)
-        stretch *= np.exp(-self._rolled(rows, centre, radius) / (2.0 * radius))[:, None, None]
-        self.stretch[rows], self.load[rows], self.centre[rows] = stretch, limit, centre
+        kept = np.exp(-self._rolled(rows, centre, radius) / (2.0 * radius))
+        for k, row in enumerate(zip(*rows, strict=True)):
+            parts = _Parts.of(self, row, self.stiffness[row][0])
+            parts.halve_whole()
+            parts.slip(displacement[k], limit[k] / np.maximum(self.stiffness[row], 1e-30), kept[k])
+            self.stretch[row], self.inner[row], self.mean[row] = parts.stretch.reshape(-1, 3), parts.inner, parts.mean()
+        self.load[rows], self.centre[rows] = limit, centre
         self.moved[rows] = displacement[:, :2]
 
     def _rolled(self, rows: tuple[np.ndarray, ...], centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
@@ -78,3 +97,95 @@ class ShearOracle:
         same_way = np.vecdot(play[:, 0], play[:, 1]) > 0.0
         self.play[rows] = play * (1.0 - play_share[:, :, None])
         return np.where(same_way, beyond.min(axis=1), 0.0)
+
+
+class _Parts:
+    """Rings of one contact by places on the coordinate of its shear stiffness, in widths of a ring."""
+
+    def __init__(self, stretch: np.ndarray, inner: np.ndarray, width: float, stiffness: float) -> None:
+        self.stretch, self.inner, self.width, self.size = stretch, inner, width, stiffness / width
+        """(MOST_RINGS, 2, 3), (MOST_RINGS,), of a ring [N/m], of the contact."""
+
+    @staticmethod
+    def of(shear: ShearOracle, row: tuple[int, ...], stiffness: float) -> _Parts:
+        return _Parts(shear.stretch[row].reshape(-1, 2, 3).copy(), shear.inner[row].copy(), shear.width[row], stiffness)
+
+    def edges(self) -> tuple[np.ndarray, np.ndarray]:
+        """Places (MOST_RINGS, 2) where parts begin and end."""
+        low = np.arange(MOST_RINGS, dtype=float)
+        edge, high = np.minimum(low + self.inner, self.size), np.minimum(low + 1.0, self.size)
+        return np.stack([np.minimum(low, self.size), edge], axis=1), np.stack([edge, high], axis=1)
+
+    def weights(self) -> np.ndarray:
+        """Of parts, (MOST_RINGS, 2, 3): along as the radius, about the normal as its cube."""
+        low, high = self.edges()
+        return np.stack([high - low, high - low, high**3 - low**3], axis=2)
+
+    def mean(self) -> np.ndarray:
+        weights = self.weights()
+        return (weights * self.stretch).sum(axis=(0, 1)) / weights.sum(axis=(0, 1))
+
+    def means(self) -> np.ndarray:
+        """Of rings, (MOST_RINGS, 3); 0 where there is none."""
+        weights = self.weights()
+        whole = weights.sum(axis=1)
+        return (weights * self.stretch).sum(axis=1) / np.where(whole > 0.0, whole, 1.0)
+
+    def shrink(self, stiffness: float) -> None:
+        self.size = stiffness / self.width
+        covered = np.clip(self.size - np.arange(MOST_RINGS), 0.0, 1.0)
+        gone = (covered < 1.0) & (covered <= self.inner)
+        self.inner = np.where(gone, covered, self.inner)
+        self.stretch[gone, 1] = 0.0
+        self.stretch[covered == 0.0] = 0.0
+
+    def grow(self, stiffness: float, twist: float) -> None:
+        k, old, size = int(self.size), self.size, stiffness / self.width
+        if old > k:
+            first, second = self.stretch[k]
+            scale = np.array([1.0, 1.0, twist])
+            if scale @ second**2 >= 0.01 * (scale @ first**2):
+                self.stretch[k] = self.means()[k], np.zeros(3)
+                self.inner[k] = old - k
+            else:
+                before = self.weights()[k, 1]
+                self.size = size
+                self.stretch[k, 1] *= before / self.weights()[k, 1]
+        self.size = size
+
+    def doubled(self) -> _Parts:
+        means, stretch, inner = self.means(), np.zeros_like(self.stretch), np.zeros(MOST_RINGS)
+        for k in range(MOST_RINGS // 2):
+            if self.size > 2 * k + 1:
+                inner[k], stretch[k] = 0.5, means[2 * k : 2 * k + 2]
+            else:
+                inner[k], stretch[k] = 0.5 * self.inner[2 * k], self.stretch[2 * k]
+        return _Parts(stretch, inner, 2.0 * self.width, self.size * self.width)
+
+    def halved(self) -> _Parts:
+        inner, half = np.zeros(MOST_RINGS), 2.0 * self.inner[: MOST_RINGS // 2]
+        inner[::2], inner[1::2] = np.minimum(half, 1.0), np.maximum(half - 1.0, 0.0)
+        stretch = np.repeat(self.stretch[: MOST_RINGS // 2], 2, axis=0)
+        stretch[::2][half >= 1.0, 1] = 0.0
+        stretch[1::2][half <= 1.0, 0] = 0.0
+        stretch[np.arange(MOST_RINGS) >= 2.0 * self.size] = 0.0
+        return _Parts(stretch, inner, 0.5 * self.width, self.size * self.width)
+
+    def halve_whole(self) -> None:
+        whole = (np.arange(MOST_RINGS) + 1.0 <= self.size) & ((self.inner <= 0.0) | (self.inner >= 1.0))
+        for k in np.flatnonzero(whole):
+            self.stretch[k] = self.stretch[k, 1 if self.inner[k] <= 0.0 else 0]
+            self.inner[k] = 0.5
+
+    def slip(self, displacement: np.ndarray, limit: np.ndarray, kept: float) -> None:
+        """``limit`` (2,): force and torque of slip over the stiffness."""
+        low, high = (places / self.size for places in self.edges())
+        real = high > low
+        share = np.where(real, high - low, 1.0)
+        # Means of 1 − y² over y and over y³.
+        along = 1.0 - (high**3 - low**3) / (3.0 * share)
+        about = 1.0 - 0.6 * (high**5 - low**5) / np.where(real, high**3 - low**3, 1.0)
+        largest = np.stack([1.5 * limit[0] * along, 1.5 * limit[0] * along, 2.5 * limit[1] * about], axis=2)
+        stretch = self.stretch + displacement
+        part = np.linalg.norm(stretch / np.maximum(largest, 1e-30), axis=2)
+        self.stretch = np.where(real[..., None], kept * stretch / np.maximum(part, 1.0)[..., None], self.stretch)

@@ -11,6 +11,7 @@ import warp as wp
 
 from raytac.physics.rigid.contacts import LoadTables, PadContacts
 from raytac.physics.rigid.gel_contact import Bodies, GelContact
+from raytac.physics.rigid.shear import LEAST_RINGS, MOST_RINGS
 from raytac.se3 import rotations
 from raytac.shapes.part import primitive
 from raytac.specs import load_sensor
@@ -21,6 +22,7 @@ from tests.physics.rigid.oracle_rows import gel_rows, row_axes
 from tests.physics.rigid.oracle_shear import ShearOracle
 from tests.physics.rigid.oracle_spring import contact_rate, normal_spring
 from tests.physics.rigid.oracle_steps import StepChoice
+from tests.physics.rigid.sheared import Sheared
 
 MINI = load_sensor("gelsight_mini").gelpad
 GELS = MINI, replace(MINI, youngs_modulus=2.0 * MINI.youngs_modulus, hysteresis=0.1, relaxation_time=3e-3)
@@ -78,9 +80,17 @@ def random_state(seed: int, num_envs: int = ENVS) -> State:
     }
     numbers["inverse_weight"][:, [2, 6]] = 0.0  # the second pad and the last body do not move
     slots, there = (num_envs, PADS, COUNT + PADS), rng.random((num_envs, PADS, COUNT + PADS, 1)) < 0.5
+    stiffness = np.where(there, rng.uniform(0.5, 1.5, (*slots, 2)) * [2e3, 0.05], 0.0)
+    size = rng.uniform(LEAST_RINGS, MOST_RINGS, slots)
+    covered = np.clip(size[..., None] - np.arange(MOST_RINGS), 0.0, 1.0)
+    inner = covered * rng.choice([0.0, 0.3, 1.0], covered.shape)
+    parts = there & (np.stack([inner, covered - inner], axis=-1).reshape(*slots, -1) > 0.0)
     shear = {
-        "stretch": np.where(there[..., None], rng.normal(0.0, [1e-4, 1e-4, 0.02], (*slots, 8, 3)), 0.0),
-        "stiffness": np.where(there, rng.uniform(0.5, 1.5, (*slots, 2)) * [2e3, 0.05], 0.0),
+        "stretch": np.where(parts[..., None], rng.normal(0.0, [1e-4, 1e-4, 0.02], (*parts.shape, 3)), 0.0),
+        "inner": np.where(there, inner, 0.0),
+        "width": stiffness[..., 0] / size,
+        "mean": np.where(there, rng.normal(0.0, [1e-4, 1e-4, 0.02], (*slots, 3)), 0.0),
+        "stiffness": stiffness,
         "load": np.where(there, rng.uniform(0.5, 1.5, (*slots, 2)), 0.0),
         "centre": np.where(there, rng.normal(0.0, 2e-3, (*slots, 3)), 0.0),
         "play": np.where(there[..., None], rng.normal(0.0, 2e-4, (*slots, 2, 2)), 0.0),
@@ -303,6 +313,31 @@ def test_a_step_of_the_kernels_is_that_of_numpy(seed: int) -> None:
     same(contact.views.acceleration[~step.lost], acceleration[~step.lost])
 
 
+def test_shear_of_loads_that_swing_is_that_of_numpy() -> None:
+    """Rings come and go, join and part, over many steps."""
+    rng, count = np.random.default_rng(2), 40
+    kernels, oracle = Sheared(count, 1, 1), ShearOracle(count, 1, 1)
+    rows = np.arange(count), np.zeros(count, int), np.zeros(count, int)
+    seen = set()
+    for k in range(60):
+        stiffness = 1e3 * np.exp(rng.normal(0.0, (0.05, 0.4, 3.0)[k % 3], count))
+        both = np.stack([stiffness, 1e-11 * stiffness**3], axis=1)
+        before, centre = oracle.width[rows].copy(), rng.normal(0.0, 1e-4, (count, 3))
+        expected = oracle.begin(rows, both, centre)
+        np.testing.assert_allclose(kernels.begin(rows, both, centre), expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
+        seen |= set(np.sign(oracle.width[rows] - before).tolist())
+        moved = rng.normal(0.0, [3e-5, 3e-5, 0.01], (count, 3))
+        limit = np.stack([rng.uniform(0.1, 1.0, count), rng.uniform(1e-4, 1e-3, count)], axis=1)
+        for state in (oracle, kernels):
+            state.move(rows, moved, limit, centre, np.full(count, 2e-3))
+        for name in ("stretch", "inner", "width", "mean"):
+            expected = getattr(oracle, name)
+            np.testing.assert_allclose(
+                getattr(kernels, name), expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max(), err_msg=name
+            )
+    assert seen == {-1.0, 0.0, 1.0}
+
+
 def taken(state: State, envs: np.ndarray) -> State:
     def of(values: Any) -> Any:
         return {name: one[envs] for name, one in values.items()} if isinstance(values, dict) else values[envs]
@@ -320,7 +355,8 @@ def results(contact: GelContact, num_envs: int) -> dict[str, np.ndarray]:
     contact.end(num_envs)
     held = of_slots(contact, "held").astype(bool)
     result = {name: of_slots(contact, name) * held[..., None] for name in ("place", "friction", "force", "regularisation")}
-    result |= {name: getattr(contact.shear.struct, name).numpy() for name in ("stretch", "stiffness", "load", "play")}
+    names = "stretch", "inner", "width", "mean", "stiffness", "load", "play"
+    result |= {name: getattr(contact.shear.struct, name).numpy() for name in names}
     return result | {"wrench": contact.wrenches.numpy(), "length": contact.steps.length.numpy(), "held": held}
 
 
