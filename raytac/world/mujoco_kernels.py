@@ -49,6 +49,8 @@ class Memory:
     site_xmat: wp.int32
     subtree_com: wp.int32
     cvel: wp.int32
+    cdof: wp.int32
+    qacc_smooth: wp.int32
     efc_J_rownnz: wp.int32
     efc_J_rowadr: wp.int32
     efc_J_colind: wp.int32
@@ -112,10 +114,16 @@ def read_frames(
     sites: wp.array(dtype=wp.int32),
     bodies: wp.array(dtype=wp.int32),
     roots: wp.array(dtype=wp.int32),
+    last: wp.array(dtype=wp.int32),
+    parents: wp.array(dtype=wp.int32),
     # outputs
     frames: Frames,
 ):
-    """Frames of pads, at their sites, and of bodies. ``bodies``: those that carry the pads first; ``roots``: of their kinematic trees."""
+    """Frames of pads, at their sites, and of bodies, with their velocities and free accelerations.
+
+    ``bodies``: those that carry the pads first; ``roots``: of their kinematic trees; ``last``: last degree of freedom that moves each, −1
+    of none; ``parents``: of the degrees of freedom. As in a constraint row, the accelerations hold nothing of what velocities alone give.
+    """
     row, k = wp.tid()
     env, body = steps.envs[row], bodies[k]
     place, turn = wp.vec3d(), wp.mat33d()
@@ -133,6 +141,15 @@ def read_frames(
     frames.turn[row, k] = turn
     frames.spin[row, k] = spin
     frames.velocity[row, k] = vector(twist, 2 * body + 1) + wp.cross(spin, place - about)
+    axes, smooth = doubles(memory, env, memory.cdof), doubles(memory, env, memory.qacc_smooth)
+    swing, push = wp.vec3d(), wp.vec3d()
+    dof = last[k]
+    while dof >= 0:
+        swing += smooth[dof] * vector(axes, 2 * dof)
+        push += smooth[dof] * vector(axes, 2 * dof + 1)
+        dof = parents[dof]
+    frames.swing[row, k] = swing
+    frames.push[row, k] = push + wp.cross(swing, place - about)
 
 
 @wp.kernel

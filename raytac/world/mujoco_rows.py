@@ -65,7 +65,8 @@ class MujocoRows:
         for name in _INTEGERS:
             setattr(memory, name, one.offset[name] // 4)
         steps, slots = contact.steps, contact.slots
-        indices = [_array(values) for values in (sites, bodies, model.body_rootid[bodies])]
+        roots, last = model.body_rootid[bodies], np.array([_last_dof(model, body) for body in bodies.tolist()])
+        indices = [_array(values) for values in (sites, bodies, roots, last, model.dof_parentid)]
         gels, others = _array(geoms[len(geoms) - pads :]), _array(geoms)
         self._read = Launch(read_frames, (len(bodies),), [memory, steps, *indices, contact.frames])
         self._write = Launch(write_contacts, (), [memory, steps, slots, gels, others])
@@ -87,6 +88,12 @@ class MujocoRows:
         """``mj_step1``."""
         for b in envs:
             mujoco.mj_step1(self._models[b], self._datas[b])
+
+    def accelerate(self, envs: Sequence[int]) -> None:
+        """Accelerations that everything but contacts and other constraints would give, by the controls; ``mj_step2`` finds the same."""
+        for b in envs:
+            mujoco.mj_fwdActuation(self._models[b], self._datas[b])
+            mujoco.mj_fwdAcceleration(self._models[b], self._datas[b])
 
     def read_frames(self, count: int) -> None:
         """Frames of pads and bodies of the environments of this step."""
@@ -135,6 +142,13 @@ class MujocoRows:
         self._forces(count)
 
 
+def _last_dof(model: mujoco.MjModel, body: int) -> int:
+    """Last degree of freedom that moves a body; −1 of one that stands still."""
+    while body and not model.body_dofnum[body]:
+        body = int(model.body_parentid[body])
+    return int(model.body_dofadr[body] + model.body_dofnum[body]) - 1 if body else -1
+
+
 def _same(one: Sequence[Any], other: Sequence[Any]) -> bool:
     return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
 
@@ -154,8 +168,8 @@ def _blank() -> mujoco.MjContact:
 
 
 _POINTERS = (
-    "contact", "qpos", "qvel", "xpos", "xmat", "site_xpos", "site_xmat", "subtree_com", "cvel", "efc_J_rownnz", "efc_J_rowadr",
-    "efc_J_colind", "efc_J", "efc_D", "efc_R", "efc_vel", "efc_aref", "efc_force",
+    "contact", "qpos", "qvel", "xpos", "xmat", "site_xpos", "site_xmat", "subtree_com", "cvel", "cdof", "qacc_smooth", "efc_J_rownnz",
+    "efc_J_rowadr", "efc_J_colind", "efc_J", "efc_D", "efc_R", "efc_vel", "efc_aref", "efc_force",
 )  # fmt: skip
 _DOUBLES = ("dist", "pos", "frame", "friction", "mu")
 _INTEGERS = ("dim", "geom1", "geom2", "geom", "efc_address")

@@ -52,7 +52,7 @@ class GelContact:
     Attributes:
         ticks: parts of the scene's step, the length of the shortest one.
         search: for contacts of bodies.
-        frames: frames and velocities of n environments, which ``begin`` reads.
+        frames: frames, velocities and free accelerations of n environments, which ``begin`` reads.
         motion, steps, slots: motion, environments and contacts of the step.
         force, velocity: of the rows at the end of the step, (B, pads, bodies + pads, ROWS), which ``end`` reads.
         before: ``pad_from_body`` (B, pads, bodies) at the last step, which ``move`` renews; NaN where unknown.
@@ -71,7 +71,6 @@ class GelContact:
         *,
         num_envs: int,
         timestep: float,
-        fall: float,
         case_travel: float,
         device: str = "cpu",
     ) -> None:
@@ -83,7 +82,6 @@ class GelContact:
             numbers: those of ``Differences`` that environments may change, (B, …); on the CPU the arrays themselves are read in every step.
             num_envs: B.
             timestep: the scene's step [s].
-            fall: acceleration [m/s²] that may close a gap on top of its speed.
             case_travel: greatest travel of a body beside a case in a step [m].
             device: "cpu" or "cuda".
         """
@@ -115,8 +113,8 @@ class GelContact:
         self.before.fill_(wp.mat44d(*[np.nan] * 16))
         self.shear = ShearState(*slots, device=device)
         self.views = _Views(self, count) if self.device.is_cpu else None
-        self._whole, self._clock, self._fall = False, [float(timestep), self.ticks], float(fall)
-        inputs = [self.frames, self.steps, self._gels, self._touched, self.before, *self._clock, self._fall, float(case_travel)]
+        self._whole, self._clock = False, [float(timestep), self.ticks]
+        inputs = [self.frames, self.steps, self._gels, self._touched, self.before, *self._clock, float(case_travel)]
         inputs += [self.motion, self.slots, self.search.poses, self.search.reach]
         self._move = self._launch(move_bodies, (pads,), inputs)
         self._choose = self._launch(choose_steps, (), [self.motion, self.slots, *self._clock, 0, self.steps])
@@ -172,7 +170,7 @@ class GelContact:
         places = [*search.poses.shape[1:], pad, body]
         shared = [self._numbers, self._gels, self._touched]
         to_approach = [search.rows, search.near, search.ends, *places, self.motion, *shared, self.acceleration, *self._clock]
-        to_set = [search.rows, *places, self.motion, *shared, self._fall, self.steps, self.shear.struct, self.slots]
+        to_set = [search.rows, *places, self.frames, self.motion, *shared, self.steps, self.shear.struct, self.slots]
         return [*to_approach, self.steps, self.slots], to_set
 
     def _search(self, count: int) -> list[_Results]:
@@ -331,9 +329,9 @@ def _array(values: Any, dtype: Any, device: Any) -> wp.array:
     return wp.array(np.asarray(values), dtype=dtype, device=device)
 
 
-_FRAMES: dict[str, Any] = {"place": wp.vec3d, "turn": wp.mat33d, "velocity": wp.vec3d, "spin": wp.vec3d}
+_FRAMES: dict[str, Any] = dict.fromkeys(("place", "velocity", "spin", "push", "swing"), wp.vec3d) | {"turn": wp.mat33d}
 _STEPS: dict[str, Any] = dict.fromkeys(("envs", "done", "ticks", "lost", "contacts"), wp.int32) | {"length": wp.float64}
-_MOTION: dict[str, Any] = {"pose": wp.mat44d, "velocity": wp.vec3d, "spin": wp.vec3d}
+_MOTION: dict[str, Any] = {"pose": wp.mat44d, "velocity": wp.vec3d, "spin": wp.vec3d, "push": wp.float64}
 _SLOTS: dict[str, Any] = {
     "row": wp.int32,
     "held": wp.int32,

@@ -26,7 +26,7 @@ from __future__ import annotations
 import warp as wp
 
 from raytac.physics.rigid.contact_rows import Rows
-from raytac.physics.rigid.motion_kernels import place_of, turn_of
+from raytac.physics.rigid.motion_kernels import Frames, closing_push, place_of, turn_of
 from raytac.physics.rigid.shear_kernels import begin_shear, clear_shear, move_shear
 from raytac.physics.rigid.spring_kernels import normal_spring
 from raytac.physics.rigid.step_kernels import law_of
@@ -80,11 +80,11 @@ def set_rows(
     bodies: wp.int32,
     first_pad: wp.int32,
     first_body: wp.int32,
+    frames: Frames,
     motion: Motion,
     vary: Differences,
     gels: Gels,
     touched: Touched,
-    fall: wp.float64,
     # outputs
     steps: Steps,
     shear: Shear,
@@ -98,13 +98,16 @@ def set_rows(
         return
     env, step = steps.envs[i], steps.length[i]
     law = law_of(rows, row, vary, gels, touched, env, pad, body)
+    centre, normal, spread = rows.centre[row], rows.normal[row], rows.spread[row]
+    rotation = turn_of(motion.world_from_pad[i, pad])
+    at = rotation * centre + place_of(motion.world_from_pad[i, pad])
+    push = closing_push(frames, touched, i, pad, body, at, rotation * normal)
     spring = normal_spring(
         rows, law, rows.depth[row], slots.speed[i, pad, body], compliance_of(vary, gels, env, pad, body), step,
-        gels.relaxation[pad], fall,
+        gels.relaxation[pad], push,
     )  # fmt: skip
     if not spring.damping > _0:
         return
-    centre, normal, spread = rows.centre[row], rows.normal[row], rows.spread[row]
     deepest = wp.max(spring.deepest, _0)
     radius, load = radius_at(rows, law, deepest), force_at(rows, law, deepest)[0]
     factor, square = softening(vary, gels, touched, env, pad, body), radius * radius
@@ -144,14 +147,13 @@ def set_rows(
         excess = wp.max(wp.length(tangential) - friction * spring.force, _0)
         lift = friction * spring.damping / damping * excess
 
-    rotation = turn_of(motion.world_from_pad[i, pad])
     slots.held[i, pad, body] = 1
     wp.atomic_add(steps.contacts, i, 1)
     slots.centre[i, pad, body] = centre
     slots.radius[i, pad, body] = radius
     slots.axes[i, pad, body] = axes
     slots.turn[i, pad, body] = wp.vec2d(cos, sin)
-    slots.place[i, pad, body] = rotation * centre + place_of(motion.world_from_pad[i, pad])
+    slots.place[i, pad, body] = at
     slots.frame[i, pad, body] = axes * wp.transpose(rotation)
     slots.friction[i, pad, body, 0] = friction
     slots.friction[i, pad, body, 1] = friction

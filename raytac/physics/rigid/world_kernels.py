@@ -86,6 +86,8 @@ class Motion:
     """Of bodies' origins relative to the pad [m/s], pad frame."""
     spin: wp.array3d(dtype=wp.vec3d)
     """Relative to the pad [rad/s]."""
+    push: wp.array3d(dtype=wp.float64)
+    """Greatest free acceleration of any point of a body against any of the pad [m/s²]."""
     case_step: wp.array2d(dtype=wp.float64)
     """Longest step [s] in which no body's ball enters the case far, (n, pads)."""
     before: wp.array3d(dtype=wp.mat44d)

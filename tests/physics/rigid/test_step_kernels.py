@@ -31,7 +31,7 @@ SHAPES = [
     (primitive("cylinder", (2e-3, 5e-3)),),
 ]
 PADS, COUNT, ENVS = len(GELS), len(SHAPES), 60
-TIMESTEP, FALL, CASE_TRAVEL = 0.004, 9.81, 2.4e-3
+TIMESTEP, CASE_TRAVEL = 0.004, 2.4e-3
 CASE_CENTRE, CASE_HALF = np.tile([0.0, 0.0, -0.02], (PADS, 1)), np.tile([0.016, 0.016, 0.0155], (PADS, 1))
 MASS_CENTRE = np.vstack([np.linspace(-1e-3, 1e-3, 3 * COUNT).reshape(COUNT, 3), np.zeros((PADS, 3))])
 CARRIER = np.array([1, 2])
@@ -68,6 +68,8 @@ def random_state(seed: int, num_envs: int = ENVS) -> State:
         "turn": turn,
         "velocity": rng.normal(0.0, 0.1, place.shape),
         "spin": rng.normal(0.0, 2.0, place.shape),
+        "push": rng.normal(0.0, 20.0, place.shape),
+        "swing": rng.normal(0.0, 500.0, place.shape),
     }
     friction = rng.uniform(0.1, 1.5, (num_envs, COUNT))
     numbers = {
@@ -100,7 +102,6 @@ def gel_contact(state: State, device: str = "cpu") -> GelContact:
         state.numbers,
         num_envs=num_envs,
         timestep=TIMESTEP,
-        fall=FALL,
         case_travel=CASE_TRAVEL,
         device=device,
     )
@@ -128,12 +129,12 @@ class Step:
     def __init__(self, state: State, contact: GelContact) -> None:
         self.state, num_envs = state, len(state.done)
         envs = np.arange(num_envs)
-        self.motion = motion_of(pads=PADS, **state.frames)
+        self.motion = motion_of(pads=PADS, **{name: state.frames[name] for name in ("place", "turn", "velocity", "spin")})
         self.choice = choice = StepChoice(TIMESTEP)
         self.left = left = TIMESTEP * (1.0 - state.done / choice.ticks)
         radius = np.array([4e-3, np.sqrt(29.0) * 1e-3, np.inf, np.hypot(2e-3, 5e-3)])
         speed = self.motion.greatest_speed(radius)
-        self.reach = speed.max(axis=2) * left[:, None] + FALL * left[:, None] ** 2
+        self.reach = speed.max(axis=2) * left[:, None] + self.greatest_push(radius).max(axis=2) * left[:, None] ** 2
         apart = np.abs(self.motion.pad_from_body[:, :, :COUNT, :3, 3] - CASE_CENTRE[:, None]) - CASE_HALF[:, None]
         beside = choice.beside_case(np.linalg.norm(np.maximum(apart, 0.0), axis=-1) - radius, speed)
         beside[..., 2] = np.inf
@@ -156,6 +157,26 @@ class Step:
         self.speed = self.motion.closing(self.contacts, self.contacts.env)
         self.longest, self.length = self._lengths()
         self._spring()
+
+    def greatest_push(self, radius: np.ndarray) -> np.ndarray:
+        """Greatest free accelerations (n, pads, bodies) of any point of bodies in balls of a radius against any of the pad."""
+        push, swing = (np.linalg.norm(self.state.frames[name], axis=-1) for name in ("push", "swing"))
+        place, size = self.state.frames["place"], np.minimum(radius, 1.0)
+        apart = np.linalg.norm(place[:, None, PADS:] - place[:, :PADS, None], axis=-1)
+        pad, body = swing[:, :PADS, None], swing[:, None, PADS:]
+        return push[:, :PADS, None] + push[:, None, PADS:] + pad * apart + (pad + body) * size
+
+    def free(self, contacts: PadContacts) -> tuple[np.ndarray, np.ndarray]:
+        """Free accelerations (n, 3) of pad and body where they touch, pad frame."""
+        frames, env, at = self.state.frames, contacts.env, self.motion.world_from_pad[contacts.env, contacts.pad]
+        point = (at[:, :3, :3] @ contacts.centre[..., None])[..., 0] + at[:, :3, 3]
+        of = [contacts.pad, np.where(contacts.body < COUNT, PADS + contacts.body, contacts.body - COUNT)]
+        each = [frames["push"][env, k] + cross(frames["swing"][env, k], point - frames["place"][env, k]) for k in of]
+        return turned(each[0], at[:, :3, :3]), turned(each[1], at[:, :3, :3])
+
+    def push(self, contacts: PadContacts) -> np.ndarray:
+        pad, body = self.free(contacts)
+        return np.maximum(np.vecdot(pad, contacts.normal), 0.0) + np.maximum(-np.vecdot(body, contacts.normal), 0.0)
 
     def law(self, contacts: PadContacts) -> LoadTables:
         return LoadTables(contacts, self.thickness(contacts), self.softer(contacts))
@@ -191,7 +212,7 @@ class Step:
     def _spring(self) -> None:
         contacts, step = self.contacts, self.length[self.contacts.env]
         tau = np.array([gel.relaxation_time for gel in GELS])[contacts.pad]
-        spring = normal_spring(self.law(contacts), contacts.depth, self.speed, self.compliance, step, tau, FALL)
+        spring = normal_spring(self.law(contacts), contacts.depth, self.speed, self.compliance, step, tau, self.push(contacts))
         held = (spring.damping > 0.0) & ~self.lost[contacts.env]
         self.held, self.closing = chosen(contacts, held), self.speed[held]
         spring = type(spring)(spring.force[held], spring.damping[held], spring.deepest[held])
