@@ -56,6 +56,59 @@ def test_a_light_finger_that_shuts_with_much_force_does_not_go_through() -> None
     assert deepest < 1.3 * sunk
 
 
+SLIDE = """<body name="body" pos="-.002 0 .005"><joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+<geom type="sphere" size=".005" mass="{}"/></body>"""
+SERVO = '<actuator><velocity joint="x" kv="200"/><motor joint="z"/></actuator>'
+
+
+@pytest.mark.parametrize("jacobian", ["dense", "sparse"])
+@pytest.mark.parametrize(("mass", "timestep"), [(0.02, 5e-3), (0.02, 1e-2), (0.2, 1e-2)])
+def test_a_slide_begins_and_ends_under_the_same_load(mass: float, timestep: float, jacobian: str) -> None:
+    """Nothing acts along the normal but 1 N, while a servo moves the ball at once by 20 mm/s, stops it and moves it back."""
+    friction, force, slip = {"body": 0.3}, [], []
+    world = flat_world(SLIDE.format(mass), timestep, SERVO, touches=friction)
+    world.model.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{jacobian.upper()}")
+    for seconds, speed in ((0.2, 0.0), (0.06, 0.02), (0.05, 0.0), (0.06, -0.02)):
+        for k in range(round(seconds / timestep)):
+            load = -world.step(np.array([speed, -1.0])).wrench["pad"][0, [2, 0]]
+            if speed or force:
+                force.append(load[0])
+                slip.append(abs(load[1]) / load[0])
+    np.testing.assert_allclose(force, 1.0, atol=0.02)
+    # It slid indeed.
+    assert max(slip) == pytest.approx(0.3, rel=1e-3)
+
+
+def test_a_body_that_slides_into_the_gel_sinks_as_deep_as_one_that_does_not() -> None:
+    """Friction takes no part in the normal force of an impact."""
+    deepest = []
+    for speed in (0.0, 0.1):
+        world = flat_world(SLIDE.format(0.2), 5e-3, SERVO, touches={"body": 0.3})
+        world.data[0].qpos[1], world.data[0].qvel[:] = 0.2e-3, [speed, -0.05]
+        sunk = []
+        for _ in range(12):
+            world.step(np.array([speed, -1.0]))
+            sunk.append(-float(world.data[0].qpos[1]))
+        deepest.append(max(sunk))
+    assert deepest[1] == pytest.approx(deepest[0], rel=0.01)
+
+
+def test_a_batch_foresees_slides_as_its_environments_alone() -> None:
+    """Each has a servo of its own and begins to slide when it likes."""
+    speeds = np.array([0.02, 0.0, -0.05])
+    both = flat_world(SLIDE.format(0.02), 5e-3, SERVO, num_envs=3, touches={"body": 0.3})
+    some = [flat_world(SLIDE.format(0.02), 5e-3, SERVO, touches={"body": 0.3}) for _ in speeds]
+    for k in range(30):
+        controls = np.stack([speeds * (k > 15 + np.arange(3)), np.full(3, -1.0)], axis=1)
+        both.step(controls)
+        for world, control in zip(some, controls, strict=True):
+            world.step(control)
+    for b, world in enumerate(some):
+        np.testing.assert_array_equal(both.data[b].qpos, world.data[0].qpos)
+        np.testing.assert_array_equal(both.data[b].qvel, world.data[0].qvel)
+    assert abs(both.data[0].qvel[0]) > 1e-3
+
+
 def test_controls_of_a_step_are_known_before_its_contacts() -> None:
     """A controller is called once a step, and its force of this very step closes the gap."""
     calls = []

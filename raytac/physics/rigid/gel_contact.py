@@ -222,6 +222,7 @@ class _Views:
         self.length: np.ndarray = contact.steps.length.numpy()
         self.lost: np.ndarray = contact.steps.lost.numpy()
         self.contacts: np.ndarray = contact.steps.contacts.numpy()
+        self.slides: np.ndarray = contact.steps.slides.numpy()
         self.suspect: np.ndarray = contact.motion.suspect.numpy()
         self.near_gel: np.ndarray = contact.motion.near_gel.numpy()
         self.poses: np.ndarray = contact.motion.pose.numpy()[:, :, :bodies]
@@ -330,7 +331,7 @@ def _array(values: Any, dtype: Any, device: Any) -> wp.array:
 
 
 _FRAMES: dict[str, Any] = dict.fromkeys(("place", "velocity", "spin", "push", "swing"), wp.vec3d) | {"turn": wp.mat33d}
-_STEPS: dict[str, Any] = dict.fromkeys(("envs", "done", "ticks", "lost", "contacts"), wp.int32) | {"length": wp.float64}
+_STEPS: dict[str, Any] = dict.fromkeys(("envs", "done", "ticks", "lost", "contacts", "slides"), wp.int32) | {"length": wp.float64}
 _MOTION: dict[str, Any] = {"pose": wp.mat44d, "velocity": wp.vec3d, "spin": wp.vec3d, "push": wp.float64}
 _SLOTS: dict[str, Any] = {
     "row": wp.int32,
@@ -343,6 +344,9 @@ _SLOTS: dict[str, Any] = {
     "turn": wp.vec2d,
     "place": wp.vec3d,
     "frame": wp.mat33d,
+    "lift": wp.float64,
+    "compliance": wp.float64,
+    "tried": wp.vec2d,
     "wrench": wp.spatial_vectord,
     "opposite": wp.spatial_vectord,
 }

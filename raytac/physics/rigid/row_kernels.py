@@ -26,7 +26,7 @@ from __future__ import annotations
 import warp as wp
 
 from raytac.physics.rigid.contact_rows import Rows
-from raytac.physics.rigid.motion_kernels import Frames, closing_push, place_of, turn_of
+from raytac.physics.rigid.motion_kernels import Frames, closing_push, frame_of, place_of, push_at, turn_of
 from raytac.physics.rigid.shear_kernels import begin_shear, clear_shear, move_shear
 from raytac.physics.rigid.spring_kernels import normal_spring
 from raytac.physics.rigid.step_kernels import law_of
@@ -55,6 +55,9 @@ _LEVER = wp.constant(wp.float64(3.0 * 3.141592653589793 / 16.0))
 """Lever of the torque of spin over the contact's radius: Hertz's contact that slips as a whole."""
 _ROLLING = wp.constant(wp.float64(3.0 / 16.0))
 """Of the friction of rolling, over radius and hysteresis."""
+_CHANGE = wp.constant(wp.float64(0.01))
+"""Change of a lift over the normal force from which a slide counts as one that begins or ends."""
+_NAN = wp.constant(wp.float64(float("nan")))
 _ROWS = wp.constant(wp.int32(ROWS))
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
@@ -102,10 +105,10 @@ def set_rows(
     rotation = turn_of(motion.world_from_pad[i, pad])
     at = rotation * centre + place_of(motion.world_from_pad[i, pad])
     push = closing_push(frames, touched, i, pad, body, at, rotation * normal)
+    compliance = compliance_of(vary, gels, env, pad, body)
     spring = normal_spring(
-        rows, law, rows.depth[row], slots.speed[i, pad, body], compliance_of(vary, gels, env, pad, body), step,
-        gels.relaxation[pad], push,
-    )  # fmt: skip
+        rows, law, rows.depth[row], slots.speed[i, pad, body], compliance, step, gels.relaxation[pad], push
+    )
     if not spring.damping > _0:
         return
     deepest = wp.max(spring.deepest, _0)
@@ -134,18 +137,24 @@ def set_rows(
     axes = wp.matrix_from_rows(normal, one, wp.cross(normal, one))
 
     # What MuJoCo's convex cone adds to the normal force of a contact that slips, at the speed at the start of the step. Beyond the cone,
-    # the force without it, (F, T), is projected to F + μ r (T − μF) / (1 + μ² r) with r the ratio of the dampings.
+    # the force without it, (F, T), is projected to F + μ r (T − μF) / (1 + μ² r) with r the ratio of the dampings. If the free
+    # acceleration, and its friction, make a different speed at the end, a slide begins or ends.
     spin = motion.spin[i, pad, body]
     velocity = motion.velocity[i, pad, body] + wp.cross(spin, centre - place_of(pose))
     lift = wp.float64(0.0)
     if spring.force > _0:
-        tangential = wp.vec3d(
-            pull[0] + damping * wp.dot(velocity, first),
-            pull[1] + damping * wp.dot(velocity, second),
-            pull[2] / lever + damping * wp.dot(spin, normal) * lever,
-        )
-        excess = wp.max(wp.length(tangential) - friction * spring.force, _0)
-        lift = friction * spring.damping / damping * excess
+        back, frame = wp.transpose(rotation), frame_of(frames, touched, body)
+        swing = back * (frames.swing[i, frame] - frames.swing[i, pad])
+        gain = back * (push_at(frames, i, frame, at) - push_at(frames, i, pad, at))
+        normal_load = wp.max(spring.force + spring.damping * slots.speed[i, pad, body], _0)
+        limit, per_lift = friction * normal_load, friction * spring.damping / damping
+        elastic = wp.vec3d(pull[0], pull[1], pull[2] / lever)
+        slip = wp.vec3d(wp.dot(velocity, first), wp.dot(velocity, second), wp.dot(spin, normal) * lever)
+        gained = wp.vec3d(wp.dot(gain, first), wp.dot(gain, second), wp.dot(swing, normal) * lever)
+        lift = per_lift * wp.max(wp.length(elastic + damping * slip) - limit, _0)
+        free = wp.length(elastic + damping * (slip + step * gained)) - limit * (_1 + damping * step * compliance)
+        if wp.abs(per_lift * wp.max(free, _0) - lift) > _CHANGE * spring.force:
+            steps.slides[i] = 1
 
     slots.held[i, pad, body] = 1
     wp.atomic_add(steps.contacts, i, 1)
@@ -166,6 +175,9 @@ def set_rows(
         rolling = wp.max(rolling, _EDGE * radius * metacentric / (metacentric + wp.abs(height) + wp.float64(1e-9)))
         slots.friction[i, pad, body, 3 + k] = wp.max(rolling, _ROLLING * gels.hysteresis[pad] * radius)
         k += 1
+    slots.lift[i, pad, body] = lift
+    slots.compliance[i, pad, body] = compliance
+    slots.tried[i, pad, body] = wp.vec2d(_NAN, _NAN)
     slots.force[i, pad, body, 0] = spring.force - lift
     slots.force[i, pad, body, 1] = -(cos * pull[0] + sin * pull[1])
     slots.force[i, pad, body, 2] = sin * pull[0] - cos * pull[1]

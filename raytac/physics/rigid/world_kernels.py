@@ -127,6 +127,12 @@ class Slots:
     """f₀ [N, N m], (…, ROWS)."""
     regularisation: wp.array4d(dtype=wp.float64)
     """R, (…, ROWS)."""
+    lift: wp.array3d(dtype=wp.float64)
+    """Normal force that MuJoCo's cone adds, which f₀ is without [N]."""
+    compliance: wp.array3d(dtype=wp.float64)
+    """1/m of both bodies [1/kg]."""
+    tried: wp.array3d(dtype=wp.vec2d)
+    """Lift that was tried before, and by how much it was too small [N]; NaN at first."""
     wrench: wp.array3d(dtype=wp.spatial_vectord)
     """Force and torque on the pad, about its origin."""
     opposite: wp.array3d(dtype=wp.spatial_vectord)
@@ -149,6 +155,8 @@ class Steps:
     """1 where physics broke down."""
     contacts: wp.array(dtype=wp.int32)
     """Contacts of gels that are held."""
+    slides: wp.array(dtype=wp.int32)
+    """1 where a contact may begin or end to slide in this step, so that its lift is not known yet."""
 
 
 @wp.struct

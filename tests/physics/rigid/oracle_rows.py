@@ -38,6 +38,8 @@ class PadRows:
     """G [N s/m, N m s] of normal and tangents, (n, 2)."""
     step: np.ndarray
     """Δt [s], (n,)."""
+    slides: np.ndarray
+    """True (n,) where a slide may begin or end in the step."""
 
     def regularisation(self) -> np.ndarray:
         """R, (n, 6): those of spin and rolling follow from the cone's levers."""
@@ -69,6 +71,8 @@ def gel_rows(
     softer: np.ndarray,
     friction: np.ndarray,
     mass_centre: np.ndarray,
+    gain: np.ndarray,
+    compliance: np.ndarray,
 ) -> tuple[PadRows, np.ndarray]:
     """Rows of n contacts, and the matrices (n, 2, 2) from their tangents to the pad's (``tangents``).
 
@@ -81,6 +85,8 @@ def gel_rows(
         softer: factors of the gels' moduli, (n,).
         friction: Coulomb's coefficients, (n,).
         mass_centre: of what is touched, in its frame [m], (bodies, 3).
+        gain: free acceleration of the body over the gel where they touch, and its angular one, pad frame, (n, 6).
+        compliance: 1/m of both bodies [1/kg], (n,).
     """
     at = contacts.env, contacts.pad, contacts.body
     deepest = np.maximum(spring.deepest, 0.0)
@@ -105,7 +111,8 @@ def gel_rows(
     rolling = np.maximum(rolling, 3.0 / 16.0 * (hysteresis * radius)[:, None])
     pull = shear.begin(at, stiffness, contacts.centre)
     force = np.zeros((len(contacts), ROWS))
-    force[:, 0] = spring.force - _lift(contacts, spring, motion, row, friction, lever, damping, pull)
+    lift, slides = _lift(contacts, spring, motion, row, step, friction, lever, damping, pull, gain, compliance)
+    force[:, 0] = spring.force - lift
     force[:, 1:3] = -(pull[:, None, :2] @ turn)[:, 0]
     force[:, 3] = -pull[:, 2]
     rotation, origin = motion.world_from_pad[row, contacts.pad, :3, :3], motion.world_from_pad[row, contacts.pad, :3, 3]
@@ -117,6 +124,7 @@ def gel_rows(
         force,
         np.stack([spring.damping, damping], axis=1),
         step,
+        slides,
     ), turn
 
 
@@ -132,12 +140,16 @@ def _lift(
     spring: NormalSpring,
     motion: PadMotion,
     row: np.ndarray,
+    step: np.ndarray,
     friction: np.ndarray,
     lever: np.ndarray,
     damping: np.ndarray,
     pull: np.ndarray,
-) -> np.ndarray:
-    """Normal force (n,) that MuJoCo's convex cone adds to contacts that slip, at the speed at the start of the step.
+    gain: np.ndarray,
+    compliance: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal force (n,) that MuJoCo's convex cone adds to contacts that slip, at the speed at the start of the step; and whether the
+    free acceleration changes it by more than a hundredth of the load.
 
     Beyond the cone, the force without it, (F, T), is projected to F + μ r (T − μF) / (1 + μ² r) with r the ratio of the dampings.
     """
@@ -145,12 +157,18 @@ def _lift(
     arm = contacts.centre - motion.pad_from_body[at][:, :3, 3]
     velocity = motion.velocity[at] + cross(motion.spin[at], arm)
     one, two = tangents(contacts.normal)
-    slip = np.stack([np.vecdot(velocity, one), np.vecdot(velocity, two)], axis=1)
-    spin = np.vecdot(motion.spin[at], contacts.normal)
-    tangential = pull[:, :2] + damping[:, None] * slip
-    torque = pull[:, 2] / lever + damping * spin * lever
-    excess = np.sqrt(np.vecdot(tangential, tangential) + torque**2) - friction * np.maximum(spring.force, 0.0)
-    return np.where(spring.force > 0.0, friction * spring.damping / damping * np.maximum(excess, 0.0), 0.0)
+    load = np.maximum(spring.force + spring.damping * -np.vecdot(velocity, contacts.normal), 0.0)
+
+    def excess(velocity: np.ndarray, spin: np.ndarray, share: np.ndarray) -> np.ndarray:
+        slip = np.stack([np.vecdot(velocity, one), np.vecdot(velocity, two)], axis=1)
+        tangential = pull[:, :2] + damping[:, None] * slip
+        torque = pull[:, 2] / lever + damping * np.vecdot(spin, contacts.normal) * lever
+        over = np.sqrt(np.vecdot(tangential, tangential) + torque**2) - share * friction * load
+        return np.where(spring.force > 0.0, friction * spring.damping / damping * np.maximum(over, 0.0), 0.0)
+
+    ends = velocity + step[:, None] * gain[:, :3], motion.spin[at] + step[:, None] * gain[:, 3:]
+    lift, free = excess(velocity, motion.spin[at], np.ones_like(load)), excess(*ends, 1.0 + damping * step * compliance)
+    return lift, np.abs(free - lift) > 0.01 * np.maximum(spring.force, 0.0)
 
 
 def _tilt(

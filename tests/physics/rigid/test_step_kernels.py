@@ -174,6 +174,13 @@ class Step:
         each = [frames["push"][env, k] + cross(frames["swing"][env, k], point - frames["place"][env, k]) for k in of]
         return turned(each[0], at[:, :3, :3]), turned(each[1], at[:, :3, :3])
 
+    def gain(self, contacts: PadContacts) -> np.ndarray:
+        """Free accelerations (n, 6), linear and angular, of the body over the pad, pad frame."""
+        swing, env, (pad, body) = self.state.frames["swing"], contacts.env, self.free(contacts)
+        other = np.where(contacts.body < COUNT, PADS + contacts.body, contacts.body - COUNT)
+        rotation = self.motion.world_from_pad[env, contacts.pad, :3, :3]
+        return np.concatenate([body - pad, turned(swing[env, other] - swing[env, contacts.pad], rotation)], axis=1)
+
     def push(self, contacts: PadContacts) -> np.ndarray:
         pad, body = self.free(contacts)
         return np.maximum(np.vecdot(pad, contacts.normal), 0.0) + np.maximum(-np.vecdot(body, contacts.normal), 0.0)
@@ -239,6 +246,8 @@ class Step:
             softer=self.softer(self.held),
             friction=self.friction(self.held),
             mass_centre=MASS_CENTRE,
+            gain=self.gain(self.held),
+            compliance=self.compliance[held],
         )
 
     def end(self, force: np.ndarray, velocity: np.ndarray) -> np.ndarray:
@@ -299,6 +308,10 @@ def test_a_step_of_the_kernels_is_that_of_numpy(seed: int) -> None:
     np.testing.assert_array_equal(contact.views.contacts, np.bincount(step.held.env, minlength=ENVS) * ~step.lost)
     assert len(step.held) > ENVS and (step.held.body >= COUNT).any() and (step.held.depth < 0.0).any()
     rows = step.rows
+    expected = np.zeros(ENVS, bool)
+    expected[step.held.env[rows.slides]] = True
+    np.testing.assert_array_equal(contact.views.slides != 0, expected)
+    assert expected.any() and not expected.all()
     same(slots["centre"][step.slot], step.held.centre)
     same(slots["radius"][step.slot], step.radius)
     same(slots["place"][step.slot], rows.position)
@@ -309,7 +322,7 @@ def test_a_step_of_the_kernels_is_that_of_numpy(seed: int) -> None:
         same(slots["regularisation"][step.slot][:, k], rows.regularisation()[:, k], 1e-10)
 
     rng = np.random.default_rng(seed)
-    force, velocity = np.zeros((2, *expected.shape, 6))
+    force, velocity = np.zeros((2, *slots["held"].shape, 6))
     force[step.slot] = np.abs(rng.normal(0.0, 1.0, (len(step.held), 6)))
     velocity[step.slot] = rng.normal(0.0, 0.1, (len(step.held), 6))
     contact.force.assign(force)
@@ -319,7 +332,7 @@ def test_a_step_of_the_kernels_is_that_of_numpy(seed: int) -> None:
     same(contact.views.wrench[~step.lost], wrench[~step.lost], 1e-10)
     for name, values in vars(step.shear).items():
         same(getattr(contact.shear, name)[~step.lost], values[~step.lost], 1e-10)
-    acceleration = np.zeros(expected.shape)
+    acceleration = np.zeros(slots["held"].shape)
     acceleration[step.slot] = (-velocity[step.slot][:, 0] - step.closing) / rows.step
     same(contact.views.acceleration[~step.lost], acceleration[~step.lost])
 
