@@ -18,7 +18,9 @@ DISC = """<body name="body" pos="0 0 .003"><joint name="z" type="slide" axis="0 
 MOTOR = '<actuator><motor joint="z"/></actuator>'
 
 
-def flat_world(bodies: str, timestep: float, rest: str = "", gravity: float = 0.0, num_envs: int = 1, touches=None) -> TactileWorld:
+def flat_world(
+    bodies: str, timestep: float, rest: str = "", gravity: float = 0.0, num_envs: int = 1, touches=None
+) -> TactileWorld:
     """A flat gel that looks up, pad frame and world frame one, and what is over it."""
     option = f'timestep="{timestep}" cone="elliptic" integrator="implicitfast" gravity="0 0 {-gravity}"'
     spec = mujoco.MjSpec.from_string(f"<mujoco><option {option}/><worldbody>{bodies}</worldbody>{rest}</mujoco>")
@@ -69,7 +71,7 @@ def test_a_slide_begins_and_ends_under_the_same_load(mass: float, timestep: floa
     world = flat_world(SLIDE.format(mass), timestep, SERVO, touches=friction)
     world.model.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{jacobian.upper()}")
     for seconds, speed in ((0.2, 0.0), (0.06, 0.02), (0.05, 0.0), (0.06, -0.02)):
-        for k in range(round(seconds / timestep)):
+        for _ in range(round(seconds / timestep)):
             load = -world.step(np.array([speed, -1.0])).wrench["pad"][0, [2, 0]]
             if speed or force:
                 force.append(load[0])

@@ -106,9 +106,7 @@ def set_rows(
     at = rotation * centre + place_of(motion.world_from_pad[i, pad])
     push = closing_push(frames, touched, i, pad, body, at, rotation * normal)
     compliance = compliance_of(vary, gels, env, pad, body)
-    spring = normal_spring(
-        rows, law, rows.depth[row], slots.speed[i, pad, body], compliance, step, gels.relaxation[pad], push
-    )
+    spring = normal_spring(rows, law, rows.depth[row], slots.speed[i, pad, body], compliance, step, gels.relaxation[pad], push)
     if not spring.damping > _0:
         return
     deepest = wp.max(spring.deepest, _0)
