@@ -57,6 +57,7 @@ class GelContact:
         force, velocity: of the rows at the end of the step, (B, pads, bodies + pads, ROWS), which ``end`` reads.
         before: ``pad_from_body`` (B, pads, bodies) at the last step, which ``move`` renews; NaN where unknown.
         wrenches: on the pads (B, pads).
+        rolling: torque of rolling over its bound, about the pad's tangents (B, pads, bodies + pads).
         acceleration: at which contacts closed faster in their last step [m/s²], (B, pads, bodies + pads).
         shear: of the gels.
         views: of what the host reads.
@@ -107,7 +108,7 @@ class GelContact:
         self._struct(self.slots, (*slots, world.ROWS), {"force": wp.float64, "regularisation": wp.float64})
         self.steps = self._struct(world.Steps(), (num_envs,), _STEPS)
         self.force, self.velocity = (self._zeros((*slots, world.ROWS), wp.float64) for _ in range(2))
-        self.acceleration = self._zeros(slots, wp.float64)
+        self.acceleration, self.rolling = self._zeros(slots, wp.float64), self._zeros(slots, wp.vec2d)
         self.wrenches = self._zeros(all_pads, wp.spatial_vectord)
         self.before = self._zeros(bodies_of, wp.mat44d)
         self.before.fill_(wp.mat44d(*[np.nan] * 16))
@@ -118,7 +119,10 @@ class GelContact:
         inputs += [self.motion, self.slots, self.search.poses, self.search.reach]
         self._move = self._launch(move_bodies, (pads,), inputs)
         self._choose = self._launch(choose_steps, (), [self.motion, self.slots, *self._clock, 0, self.steps])
-        given, outputs = [self.force, self.velocity, self.motion], [self.shear.struct, self.acceleration, self.slots]
+        given, outputs = (
+            [self.force, self.velocity, self.motion],
+            [self.shear.struct, self.rolling, self.acceleration, self.slots],
+        )
         self._read = self._launch(read_rows, slots[1:], [*given, self.steps, self._touched, *outputs])
         self._sum = self._launch(sum_wrenches, (pads,), [self.slots, self.steps, self._touched, self.wrenches])
         self._bodies = _Results(self, self.search, 0, 0)
@@ -162,7 +166,7 @@ class GelContact:
         """Forget what environments went through, on the CPU."""
         assert self.views is not None
         self.shear.clear(envs)
-        self.views.wrench[envs] = self.views.acceleration[envs] = 0.0
+        self.views.wrench[envs] = self.views.acceleration[envs] = self.views.rolling[envs] = 0.0
         self.views.before[envs] = np.nan
 
     def results_inputs(self, search: PadSearch, pad: int, body: int) -> tuple[list[Any], list[Any]]:
@@ -170,7 +174,17 @@ class GelContact:
         places = [*search.poses.shape[1:], pad, body]
         shared = [self._numbers, self._gels, self._touched]
         to_approach = [search.rows, search.near, search.ends, *places, self.motion, *shared, self.acceleration, *self._clock]
-        to_set = [search.rows, *places, self.frames, self.motion, *shared, self.steps, self.shear.struct, self.slots]
+        to_set = [
+            search.rows,
+            *places,
+            self.frames,
+            self.motion,
+            *shared,
+            self.rolling,
+            self.steps,
+            self.shear.struct,
+            self.slots,
+        ]
         return [*to_approach, self.steps, self.slots], to_set
 
     def _search(self, count: int) -> list[_Results]:
@@ -231,6 +245,7 @@ class _Views:
         self.before: np.ndarray = contact.before.numpy()
         self.wrench: np.ndarray = contact.wrenches.numpy()
         self.acceleration: np.ndarray = contact.acceleration.numpy()
+        self.rolling: np.ndarray = contact.rolling.numpy()
 
 
 class Launch:
@@ -344,6 +359,7 @@ _SLOTS: dict[str, Any] = {
     "turn": wp.vec2d,
     "place": wp.vec3d,
     "frame": wp.mat33d,
+    "bend": wp.vec2d,
     "lift": wp.float64,
     "compliance": wp.float64,
     "tried": wp.vec2d,

@@ -127,6 +127,8 @@ class Slots:
     """f₀ [N, N m], (…, ROWS)."""
     regularisation: wp.array4d(dtype=wp.float64)
     """R, (…, ROWS)."""
+    bend: wp.array3d(dtype=wp.vec2d)
+    """Share of the torque of rolling that builds up per angle about each tangent of the row [1/rad]."""
     lift: wp.array3d(dtype=wp.float64)
     """Normal force that MuJoCo's cone adds, which f₀ is without [N]."""
     compliance: wp.array3d(dtype=wp.float64)

@@ -17,7 +17,7 @@ from raytac.specs import load_sensor
 from raytac.world.forbidden_overlap import BondedFaces
 from raytac.world.gel_pairs import GelPairs
 from tests.physics.rigid.oracle_motion import PadMotion, cross, motion_of, turned
-from tests.physics.rigid.oracle_rows import gel_rows, row_axes
+from tests.physics.rigid.oracle_rows import gel_rows, rolled_on, row_axes
 from tests.physics.rigid.oracle_shear import ShearOracle
 from tests.physics.rigid.oracle_spring import contact_rate, normal_spring
 from tests.physics.rigid.oracle_steps import StepChoice
@@ -45,6 +45,7 @@ class State:
     frames: dict[str, np.ndarray]
     numbers: dict[str, np.ndarray]
     shear: dict[str, np.ndarray]
+    rolling: np.ndarray
     acceleration: np.ndarray
     done: np.ndarray
 
@@ -89,7 +90,8 @@ def random_state(seed: int, num_envs: int = ENVS) -> State:
         "moved": np.where(there, rng.normal(0.0, 1e-4, (*slots, 2)), 0.0),
     }
     done = rng.choice([0, 1024, 3072, 3328], num_envs)
-    return State(frames, numbers, shear, np.where(there[..., 0], rng.normal(0.0, 50.0, slots), 0.0), done)
+    rolling = np.where(there, rng.uniform(-0.7, 0.7, (*slots, 2)), 0.0)
+    return State(frames, numbers, shear, rolling, np.where(there[..., 0], rng.normal(0.0, 50.0, slots), 0.0), done)
 
 
 def gel_contact(state: State, device: str = "cpu") -> GelContact:
@@ -110,6 +112,7 @@ def gel_contact(state: State, device: str = "cpu") -> GelContact:
     for name, values in state.shear.items():
         getattr(contact.shear.struct, name).assign(values)
     contact.acceleration.assign(state.acceleration)
+    contact.rolling.assign(state.rolling)
     contact.steps.envs.assign(np.arange(num_envs, dtype=np.int32))
     contact.steps.done.assign(state.done.astype(np.int32))
     return contact
@@ -248,6 +251,7 @@ class Step:
             mass_centre=MASS_CENTRE,
             gain=self.gain(self.held),
             compliance=self.compliance[held],
+            rolling=self.state.rolling[self.slot],
         )
 
     def end(self, force: np.ndarray, velocity: np.ndarray) -> np.ndarray:
@@ -257,6 +261,9 @@ class Step:
         moved[:, :2] = (turn @ velocity[:, 1:3, None])[..., 0] * rows.step[:, None]
         moved[:, 2] = velocity[:, 3] * rows.step
         self.shear.move(self.slot, moved, force[:, :1] * rows.friction[:, [0, 2]], held.centre, self.radius)
+        self.rolling = np.zeros(self.state.rolling.shape)
+        angle = (turn @ (rows.step[:, None] * rows.bend * velocity[:, 4:])[..., None])[..., 0]
+        self.rolling[self.slot] = rolled_on(self.state.rolling[self.slot], angle)
         axes = row_axes(held.normal, turn)
         push = -(force[:, None, :3] @ axes)[:, 0]
         torque = -(force[:, None, 3:] @ axes)[:, 0] + cross(held.centre, push)
@@ -332,6 +339,7 @@ def test_a_step_of_the_kernels_is_that_of_numpy(seed: int) -> None:
     same(contact.views.wrench[~step.lost], wrench[~step.lost], 1e-10)
     for name, values in vars(step.shear).items():
         same(getattr(contact.shear, name)[~step.lost], values[~step.lost], 1e-10)
+    same(contact.views.rolling[~step.lost], step.rolling[~step.lost], 1e-9)
     acceleration = np.zeros(slots["held"].shape)
     acceleration[step.slot] = (-velocity[step.slot][:, 0] - step.closing) / rows.step
     same(contact.views.acceleration[~step.lost], acceleration[~step.lost])
@@ -355,7 +363,12 @@ def results(contact: GelContact, num_envs: int) -> dict[str, np.ndarray]:
     held = of_slots(contact, "held").astype(bool)
     result = {name: of_slots(contact, name) * held[..., None] for name in ("place", "friction", "force", "regularisation")}
     result |= {name: getattr(contact.shear.struct, name).numpy() for name in ("stretch", "stiffness", "load", "play")}
-    return result | {"wrench": contact.wrenches.numpy(), "length": contact.steps.length.numpy(), "held": held}
+    return result | {
+        "wrench": contact.wrenches.numpy(),
+        "rolling": contact.rolling.numpy(),
+        "length": contact.steps.length.numpy(),
+        "held": held,
+    }
 
 
 def test_a_batch_is_its_environments_alone_to_the_bit() -> None:
