@@ -10,6 +10,9 @@ MuJoCo's own collision uses a convex hull of the body, and its number of contact
   with a the contact's radius (Hertz contact that slips as a whole, as in a press); rolling 3/16 α a (J. A. Greenwood, H. Minshall, D.
   Tabor, Hysteresis losses in rolling and sliding friction, Proc. R. Soc. A 259, 1961) with α the gel's hysteresis.
 
+What a step does before its contact is known is foreseen: controls are written before contacts are put in, and MuJoCo's acceleration
+without constraints says which gap may close, and which slide begin, within the step.
+
 All environments step together: in every step of MuJoCo their contacts are computed at once, and MuJoCo is called for one after the other.
 Where something moves fast near a pad, that environment takes shorter steps (``choose_steps``): half of the scene's, a quarter …
 """

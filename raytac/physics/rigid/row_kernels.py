@@ -11,6 +11,9 @@ end of the step. So every row is a given force and a viscous one at the end of t
 | spin | −k s, the shear's | as of the tangents on the lever of the cone |
 | rolling | −b | N m Δt, m the metacentric height |
 
+The convex cone lifts what slips, which the normal row's f₀ is less by: at the speed at the start of the step, unless a slide begins or ends
+in it. ``Steps.slides`` says where that may be, and MuJoCo's own solution for the end of the step decides then (``correct_lifts``).
+
 The last row replaces what a single contact point lacks. A flat face that tilts moves the centre of pressure by its spread m per radian, so
 the normal load turns it back with the stiffness N m, taken at the start of a step. That is stable with as much at its end, which the
 viscous row gives. Of a ball m is 0.
