@@ -23,6 +23,8 @@ _LEAST = wp.constant(wp.float64(1e-6))
 """Least coefficient of friction, which MuJoCo wants positive."""
 _BACK = wp.constant(wp.float64(0.1))
 """Share of a penetration that a step takes back."""
+_FITS = wp.constant(wp.float64(0.005))
+"""Error of a lift over the normal force that is left."""
 _LARGEST_SPEED = wp.constant(wp.float64(LARGEST_SPEED))
 _MANY = wp.constant(wp.int32(0x7FFFFFFF))
 _0 = wp.constant(wp.float64(0.0))
@@ -49,6 +51,9 @@ class Memory:
     site_xmat: wp.int32
     subtree_com: wp.int32
     cvel: wp.int32
+    cdof: wp.int32
+    qacc_smooth: wp.int32
+    qacc: wp.int32
     efc_J_rownnz: wp.int32
     efc_J_rowadr: wp.int32
     efc_J_colind: wp.int32
@@ -112,10 +117,16 @@ def read_frames(
     sites: wp.array(dtype=wp.int32),
     bodies: wp.array(dtype=wp.int32),
     roots: wp.array(dtype=wp.int32),
+    last: wp.array(dtype=wp.int32),
+    parents: wp.array(dtype=wp.int32),
     # outputs
     frames: Frames,
 ):
-    """Frames of pads, at their sites, and of bodies. ``bodies``: those that carry the pads first; ``roots``: of their kinematic trees."""
+    """Frames of pads, at their sites, and of bodies, with their velocities and free accelerations.
+
+    ``bodies``: those that carry the pads first; ``roots``: of their kinematic trees; ``last``: last degree of freedom that moves each, −1
+    of none; ``parents``: of the degrees of freedom. As in a constraint row, the accelerations hold nothing of what velocities alone give.
+    """
     row, k = wp.tid()
     env, body = steps.envs[row], bodies[k]
     place, turn = wp.vec3d(), wp.mat33d()
@@ -133,6 +144,15 @@ def read_frames(
     frames.turn[row, k] = turn
     frames.spin[row, k] = spin
     frames.velocity[row, k] = vector(twist, 2 * body + 1) + wp.cross(spin, place - about)
+    axes, smooth = doubles(memory, env, memory.cdof), doubles(memory, env, memory.qacc_smooth)
+    swing, push = wp.vec3d(), wp.vec3d()
+    dof = last[k]
+    while dof >= 0:
+        swing += smooth[dof] * vector(axes, 2 * dof)
+        push += smooth[dof] * vector(axes, 2 * dof + 1)
+        dof = parents[dof]
+    frames.swing[row, k] = swing
+    frames.push[row, k] = push + wp.cross(swing, place - about)
 
 
 @wp.kernel
@@ -240,6 +260,70 @@ def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(
                     m += 1
 
 
+@wp.func
+def row_times(memory: Memory, env: wp.int32, row: wp.int32, values: wp.array(dtype=wp.float64)) -> wp.float64:
+    """A row of the constraint's Jacobian times a vector of the degrees of freedom."""
+    jacobian = doubles(memory, env, memory.efc_J)
+    result = wp.float64(0.0)
+    if memory.sparse[0] != 0:
+        column, start = integers(memory, env, memory.efc_J_colind), integers(memory, env, memory.efc_J_rowadr)[row]
+        for k in range(start, start + integers(memory, env, memory.efc_J_rownnz)[row]):
+            result += jacobian[k] * values[column[k]]
+    else:
+        for k in range(memory.nv):
+            result += jacobian[row * memory.nv + k] * values[k]
+    return result
+
+
+@wp.kernel
+def correct_lifts(memory: Memory, steps: Steps, slots: Slots):
+    """Set the lifts in environments with a slide that begins or ends by the speeds that MuJoCo has just found for the end of the step.
+
+    A slide that is faster by a lift that is larger asks for more: the first guess follows from the contact's own mass, the others by
+    secants. ``steps.slides`` stays 1 until the lift fits.
+    """
+    i = wp.tid()
+    if steps.slides[i] == 0 or steps.lost[i] != 0:
+        return
+    env, step = steps.envs[i], steps.length[i]
+    before = doubles(memory, env, memory.efc_vel)
+    reference = doubles(memory, env, memory.efc_aref)
+    found = doubles(memory, env, memory.qacc)
+    row = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
+    slides = wp.int32(0)
+    for pad in range(slots.held.shape[1]):
+        for body in range(slots.held.shape[2]):
+            if slots.held[i, pad, body] != 0:
+                lift = slots.lift[i, pad, body]
+                regular, sheared = slots.regularisation[i, pad, body, 0], slots.regularisation[i, pad, body, 1]
+                friction, ratio = wp.max(slots.friction[i, pad, body, 0], _LEAST), sheared / regular
+                ahead = before[row] + step * row_times(memory, env, row, found)
+                normal = wp.max(slots.force[i, pad, body, 0] + lift - ahead / (regular * step), _0)
+                total = wp.float64(0.0)
+                m = wp.int32(1)
+                while m < _ROWS:
+                    ahead = before[row + m] + step * row_times(memory, env, row + m, found)
+                    part = slots.force[i, pad, body, m] - ahead / (slots.regularisation[i, pad, body, m] * step)
+                    part *= friction / wp.max(slots.friction[i, pad, body, m - 1], _LEAST)
+                    total += part * part
+                    m += 1
+                lacks = friction * ratio * wp.max(wp.sqrt(total) - friction * normal, _0) - lift
+                if wp.abs(lacks) > _FITS * normal:
+                    slides = 1
+                    tried = slots.tried[i, pad, body]
+                    square = friction * friction * ratio
+                    more = lacks * (_1 + square * slots.compliance[i, pad, body] / sheared / (_1 + square))
+                    if not wp.isnan(tried[0]) and tried[1] != lacks:
+                        more = lacks * (lift - tried[0]) / (tried[1] - lacks)
+                    slots.tried[i, pad, body] = wp.vec2d(lift, lacks)
+                    more = wp.max(more, -lift)
+                    slots.lift[i, pad, body] = lift + more
+                    slots.force[i, pad, body, 0] = slots.force[i, pad, body, 0] - more
+                    reference[row] = reference[row] - more * regular
+                row += _ROWS
+    steps.slides[i] = slides
+
+
 @wp.kernel
 def read_constraint(
     memory: Memory,
@@ -272,23 +356,12 @@ def read_constraint(
         return
     row = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
     carried = doubles(memory, env, memory.efc_force)
-    jacobian = doubles(memory, env, memory.efc_J)
-    length = integers(memory, env, memory.efc_J_rownnz)
-    start = integers(memory, env, memory.efc_J_rowadr)
-    column = integers(memory, env, memory.efc_J_colind)
     for pad in range(slots.held.shape[1]):
         for body in range(slots.held.shape[2]):
             if slots.held[i, pad, body] != 0:
                 m = wp.int32(0)
                 while m < _ROWS:
-                    value = wp.float64(0.0)
-                    if memory.sparse[0] != 0:
-                        for k in range(start[row], start[row] + length[row]):
-                            value += jacobian[k] * speed[column[k]]
-                    else:
-                        for k in range(memory.nv):
-                            value += jacobian[row * memory.nv + k] * speed[k]
                     force[i, pad, body, m] = carried[row]
-                    velocity[i, pad, body, m] = value
+                    velocity[i, pad, body, m] = row_times(memory, env, row, speed)
                     row += 1
                     m += 1

@@ -13,6 +13,7 @@ from raytac.physics.rigid.gel_contact import GelContact, Launch
 from raytac.physics.rigid.world_kernels import ROWS
 from raytac.world.mujoco_kernels import (
     Memory,
+    correct_lifts,
     read_constraint,
     read_frames,
     write_contacts,
@@ -65,12 +66,14 @@ class MujocoRows:
         for name in _INTEGERS:
             setattr(memory, name, one.offset[name] // 4)
         steps, slots = contact.steps, contact.slots
-        indices = [_array(values) for values in (sites, bodies, model.body_rootid[bodies])]
+        roots, last = model.body_rootid[bodies], np.array([_last_dof(model, body) for body in bodies.tolist()])
+        indices = [_array(values) for values in (sites, bodies, roots, last, model.dof_parentid)]
         gels, others = _array(geoms[len(geoms) - pads :]), _array(geoms)
         self._read = Launch(read_frames, (len(bodies),), [memory, steps, *indices, contact.frames])
         self._write = Launch(write_contacts, (), [memory, steps, slots, gels, others])
         self._regularise = Launch(write_regularisation, (), [memory, steps, slots])
         self._refer = Launch(write_references, (), [memory, steps, slots, _array(hard)])
+        self._correct = Launch(correct_lifts, (), [memory, steps, slots])
         self._forces = Launch(read_constraint, (), [memory, slots, steps, contact.force, contact.velocity])
 
     def bind(self, models: Sequence[mujoco.MjModel], datas: Sequence[mujoco.MjData]) -> None:
@@ -87,6 +90,12 @@ class MujocoRows:
         """``mj_step1``."""
         for b in envs:
             mujoco.mj_step1(self._models[b], self._datas[b])
+
+    def accelerate(self, envs: Sequence[int]) -> None:
+        """Accelerations that everything but contacts and other constraints would give, by the controls; ``mj_step2`` finds the same."""
+        for b in envs:
+            mujoco.mj_fwdActuation(self._models[b], self._datas[b])
+            mujoco.mj_fwdAcceleration(self._models[b], self._datas[b])
 
     def read_frames(self, count: int) -> None:
         """Frames of pads and bodies of the environments of this step."""
@@ -121,6 +130,17 @@ class MujocoRows:
                 mujoco.mj_projectConstraint(model, data)
                 mujoco.mj_referenceConstraint(model, data)
         self._refer(count)
+        self._foresee_slides(envs, views.slides[:count], views.lost[:count])
+
+    def _foresee_slides(self, envs: Sequence[int], slides: np.ndarray, lost: np.ndarray) -> None:
+        """Solve where a slide may begin or end, until its lift fits the speed at the end of the step."""
+        for _ in range(_SOLVES):
+            some = np.flatnonzero(slides & (lost == 0)).tolist()
+            if not some:
+                return
+            for i in some:
+                mujoco.mj_fwdConstraint(self._models[envs[i]], self._datas[envs[i]])
+            self._correct(len(envs))
 
     def second_half(self, envs: Sequence[int], lengths: Sequence[float], timestep: float) -> None:
         """``mj_step2`` of the length [s] of each environment's step; afterwards the models have ``timestep`` again."""
@@ -133,6 +153,17 @@ class MujocoRows:
     def read_forces(self, count: int) -> None:
         """Forces and velocities of the rows at the end of the step; environments that broke down are lost."""
         self._forces(count)
+
+
+_SOLVES = 5
+"""Solves of MuJoCo's at most for the lift of a slide that begins or ends."""
+
+
+def _last_dof(model: mujoco.MjModel, body: int) -> int:
+    """Last degree of freedom that moves a body; −1 of one that stands still."""
+    while body and not model.body_dofnum[body]:
+        body = int(model.body_parentid[body])
+    return int(model.body_dofadr[body] + model.body_dofnum[body]) - 1 if body else -1
 
 
 def _same(one: Sequence[Any], other: Sequence[Any]) -> bool:
@@ -154,8 +185,8 @@ def _blank() -> mujoco.MjContact:
 
 
 _POINTERS = (
-    "contact", "qpos", "qvel", "xpos", "xmat", "site_xpos", "site_xmat", "subtree_com", "cvel", "efc_J_rownnz", "efc_J_rowadr",
-    "efc_J_colind", "efc_J", "efc_D", "efc_R", "efc_vel", "efc_aref", "efc_force",
+    "contact", "qpos", "qvel", "xpos", "xmat", "site_xpos", "site_xmat", "subtree_com", "cvel", "cdof", "qacc_smooth", "qacc",
+    "efc_J_rownnz", "efc_J_rowadr", "efc_J_colind", "efc_J", "efc_D", "efc_R", "efc_vel", "efc_aref", "efc_force",
 )  # fmt: skip
 _DOUBLES = ("dist", "pos", "frame", "friction", "mu")
 _INTEGERS = ("dim", "geom1", "geom2", "geom", "efc_address")

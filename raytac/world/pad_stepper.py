@@ -103,6 +103,8 @@ class PadStepper:
     def add(self, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData]) -> None:
         """Put the pads' contacts into states, between ``mj_step1`` and ``mj_step2``.
 
+        Controls and applied forces must have their values of this step: they may close a gap in it.
+
         Raises:
             InputError: another model, another number of states, or no ``finish`` since the last ``add``.
         """

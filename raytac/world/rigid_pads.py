@@ -10,6 +10,9 @@ MuJoCo's own collision uses a convex hull of the body, and its number of contact
   with a the contact's radius (Hertz contact that slips as a whole, as in a press); rolling 3/16 α a (J. A. Greenwood, H. Minshall, D.
   Tabor, Hysteresis losses in rolling and sliding friction, Proc. R. Soc. A 259, 1961) with α the gel's hysteresis.
 
+What a step does before its contact is known is foreseen: controls are written before contacts are put in, and MuJoCo's acceleration
+without constraints says which gap may close, and which slide begin, within the step.
+
 All environments step together: in every step of MuJoCo their contacts are computed at once, and MuJoCo is called for one after the other.
 Where something moves fast near a pad, that environment takes shorter steps (``choose_steps``): half of the scene's, a quarter …
 """
@@ -92,7 +95,6 @@ class RigidPads:
             },
             num_envs=num_envs,
             timestep=composed.timestep,
-            fall=float(np.linalg.norm(option.gravity)),
             case_travel=_CASE_TRAVEL,
         )
         assert self._contact.views is not None  # they are on the CPU
@@ -152,18 +154,17 @@ class RigidPads:
         """One step of MuJoCo in environments ``envs``, each of its own length; returns the ticks of each, (n,)."""
         views = self._views
         self._mujoco.first_half(envs.tolist())
+        drive(envs)
         self._insert(envs, done)
         lost, lengths, sound = views.lost[: len(envs)], views.length[: len(envs)], envs
         if np.count_nonzero(lost):
             sound, lengths = envs[lost == 0], lengths[lost == 0]
-        if len(sound):
-            drive(sound)
         self._mujoco.second_half(sound.tolist(), lengths.tolist(), self.composed.timestep)
         self._finish(envs, failed)
         return views.ticks[: len(envs)]
 
     def add(self, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> np.ndarray:
-        """Put the pads' contacts into states that somebody else steps, between ``mj_step1`` and ``mj_step2``.
+        """Put the pads' contacts into states that somebody else steps, between ``mj_step1`` and ``mj_step2``, with their controls.
 
         The result is for ``finish``, after ``mj_step2``. A step is as long as the model's: it is not divided where something moves fast.
         """
@@ -189,7 +190,8 @@ class RigidPads:
         self._mujoco.read_frames(len(envs))
 
     def _insert(self, envs: np.ndarray, done: np.ndarray | int, *, whole: bool = False) -> None:
-        """Put the pads' contacts among MuJoCo's, after ``mj_step1``; ``whole``: of a step that is not divided."""
+        """Put the pads' contacts among MuJoCo's, after ``mj_step1`` and with the controls of the step; ``whole``: it is not divided."""
+        self._mujoco.accelerate(envs.tolist())
         self._read_frames(envs, done)
         self._contact.begin(len(envs), whole=whole)
         self._mark_pierced(envs)

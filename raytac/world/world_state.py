@@ -14,7 +14,7 @@ LARGEST_SPEED = 1e4
 
 Controller = Callable[[mujoco.MjData, float], None]
 """Writes ``data.ctrl`` of one environment, given the time since the reset [s]; called in every step of MuJoCo, when positions, velocities
-and bias forces are up to date."""
+and bias forces are up to date, and before the contacts of rigid pads are found, which may close by these very controls."""
 Drive = Callable[[Sequence[int] | np.ndarray], None]
 """Writes ``data.ctrl`` of the environments named, at the same moments."""
 

@@ -64,6 +64,26 @@ def test_frames_and_velocities_are_mujocos() -> None:
             np.testing.assert_allclose(frames["velocity"][b, k], twist[3:], atol=1e-12)
 
 
+def test_free_accelerations_are_those_of_mujoco_without_constraints() -> None:
+    world = TactileWorld("push_cube", outputs=(), num_envs=2)
+    for b, data in enumerate(world.data):
+        rng = np.random.default_rng(b)
+        data.qvel[:], data.ctrl[:] = rng.normal(0.0, 1.0, data.qvel.shape), rng.normal(0.0, 5.0, data.ctrl.shape)
+        data.xfrc_applied[:] = rng.normal(0.0, 1.0, data.xfrc_applied.shape)
+    pads = half_a_step(world)
+    push, swing = (getattr(pads._contact.frames, name).numpy() for name in ("push", "swing"))
+    model, bodies = world.model, [int(pads._pad_index[0]), *pads._body_index.tolist()]
+    for b, data in enumerate(world.data):
+        mujoco.mj_forward(model, data)
+        places = [data.site_xpos[int(pads._site_index[0])], *(data.xpos[body] for body in bodies[1:])]
+        for k, (body, place) in enumerate(zip(bodies, places, strict=True)):
+            linear, angular = np.zeros((2, 3, model.nv))
+            mujoco.mj_jac(model, data, linear, angular, place, body)
+            np.testing.assert_allclose(push[b, k], linear @ data.qacc_smooth, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(swing[b, k], angular @ data.qacc_smooth, rtol=1e-9, atol=1e-9)
+        assert np.abs(push[b]).max() > 1.0
+
+
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
 def test_rows_are_written_where_mujoco_keeps_them_and_their_forces_are_read_there(jacobian: str) -> None:
     world = pressed()

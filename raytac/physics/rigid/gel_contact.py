@@ -54,11 +54,12 @@ class GelContact:
     Attributes:
         ticks: parts of the scene's step, the length of the shortest one.
         search: for contacts of bodies.
-        frames: frames and velocities of n environments, which ``begin`` reads.
+        frames: frames, velocities and free accelerations of n environments, which ``begin`` reads.
         motion, steps, slots: motion, environments and contacts of the step.
         force, velocity: of the rows at the end of the step, (B, pads, bodies + pads, ROWS), which ``end`` reads.
         before: ``pad_from_body`` (B, pads, bodies) at the last step, which ``move`` renews; NaN where unknown.
         wrenches: on the pads (B, pads).
+        rolling: torque of rolling over its bound, about the pad's tangents (B, pads, bodies + pads).
         acceleration: at which contacts closed faster in their last step [m/s²], (B, pads, bodies + pads).
         shear: of the gels.
         views: of what the host reads.
@@ -73,7 +74,6 @@ class GelContact:
         *,
         num_envs: int,
         timestep: float,
-        fall: float,
         case_travel: float,
         device: str = "cpu",
     ) -> None:
@@ -85,7 +85,6 @@ class GelContact:
             numbers: those of ``Differences`` that environments may change, (B, …); on the CPU the arrays themselves are read in every step.
             num_envs: B.
             timestep: the scene's step [s].
-            fall: acceleration [m/s²] that may close a gap on top of its speed.
             case_travel: greatest travel of a body beside a case in a step [m].
             device: "cpu" or "cuda".
         """
@@ -112,18 +111,21 @@ class GelContact:
         self._struct(self.slots, (*slots, world.ROWS), {"force": wp.float64, "regularisation": wp.float64})
         self.steps = self._struct(world.Steps(), (num_envs,), _STEPS)
         self.force, self.velocity = (self._zeros((*slots, world.ROWS), wp.float64) for _ in range(2))
-        self.acceleration = self._zeros(slots, wp.float64)
+        self.acceleration, self.rolling = self._zeros(slots, wp.float64), self._zeros(slots, wp.vec2d)
         self.wrenches = self._zeros(all_pads, wp.spatial_vectord)
         self.before = self._zeros(bodies_of, wp.mat44d)
         self.before.fill_(wp.mat44d(*[np.nan] * 16))
         self.shear = ShearState(*slots, device=device)
         self.views = _Views(self, count) if self.device.is_cpu else None
-        self._whole, self._clock, self._fall = False, [float(timestep), self.ticks], float(fall)
-        inputs = [self.frames, self.steps, self._gels, self._touched, self.before, *self._clock, self._fall, float(case_travel)]
+        self._whole, self._clock = False, [float(timestep), self.ticks]
+        inputs = [self.frames, self.steps, self._gels, self._touched, self.before, *self._clock, float(case_travel)]
         inputs += [self.motion, self.slots, self.search.poses, self.search.reach]
         self._move = self._launch(move_bodies, (pads,), inputs)
         self._choose = self._launch(choose_steps, (), [self.motion, self.slots, *self._clock, 0, self.steps])
-        given, outputs = [self.force, self.velocity, self.motion], [self.shear.struct, self.acceleration, self.slots]
+        given, outputs = (
+            [self.force, self.velocity, self.motion],
+            [self.shear.struct, self.rolling, self.acceleration, self.slots],
+        )
         self._read = self._launch(read_rows, slots[1:], [*given, self.steps, self._touched, *outputs])
         self._sum = self._launch(sum_wrenches, (pads,), [self.slots, self.steps, self._touched, self.wrenches])
         self._bodies = _Results(self, self.search, 0, 0)
@@ -167,7 +169,7 @@ class GelContact:
         """Forget what environments went through, on the CPU."""
         assert self.views is not None
         self.shear.clear(envs)
-        self.views.wrench[envs] = self.views.acceleration[envs] = 0.0
+        self.views.wrench[envs] = self.views.acceleration[envs] = self.views.rolling[envs] = 0.0
         self.views.before[envs] = np.nan
 
     def results_inputs(self, search: PadSearch, pad: int, body: int) -> tuple[list[Any], list[Any]]:
@@ -175,7 +177,17 @@ class GelContact:
         places = [*search.poses.shape[1:], pad, body]
         shared = [self._numbers, self._gels, self._touched]
         to_approach = [search.rows, search.near, search.ends, *places, self.motion, *shared, self.acceleration, *self._clock]
-        to_set = [search.rows, *places, self.motion, *shared, self._fall, self.steps, self.shear.struct, self.slots]
+        to_set = [
+            search.rows,
+            *places,
+            self.frames,
+            self.motion,
+            *shared,
+            self.rolling,
+            self.steps,
+            self.shear.struct,
+            self.slots,
+        ]
         return [*to_approach, self.steps, self.slots], to_set
 
     def _search(self, count: int) -> list[_Results]:
@@ -227,6 +239,7 @@ class _Views:
         self.length: np.ndarray = contact.steps.length.numpy()
         self.lost: np.ndarray = contact.steps.lost.numpy()
         self.contacts: np.ndarray = contact.steps.contacts.numpy()
+        self.slides: np.ndarray = contact.steps.slides.numpy()
         self.suspect: np.ndarray = contact.motion.suspect.numpy()
         self.near_gel: np.ndarray = contact.motion.near_gel.numpy()
         self.poses: np.ndarray = contact.motion.pose.numpy()[:, :, :bodies]
@@ -235,6 +248,7 @@ class _Views:
         self.before: np.ndarray = contact.before.numpy()
         self.wrench: np.ndarray = contact.wrenches.numpy()
         self.acceleration: np.ndarray = contact.acceleration.numpy()
+        self.rolling: np.ndarray = contact.rolling.numpy()
 
 
 class Launch:
@@ -334,9 +348,9 @@ def _array(values: Any, dtype: Any, device: Any) -> wp.array:
     return wp.array(np.asarray(values), dtype=dtype, device=device)
 
 
-_FRAMES: dict[str, Any] = {"place": wp.vec3d, "turn": wp.mat33d, "velocity": wp.vec3d, "spin": wp.vec3d}
-_STEPS: dict[str, Any] = dict.fromkeys(("envs", "done", "ticks", "lost", "contacts"), wp.int32) | {"length": wp.float64}
-_MOTION: dict[str, Any] = {"pose": wp.mat44d, "velocity": wp.vec3d, "spin": wp.vec3d}
+_FRAMES: dict[str, Any] = dict.fromkeys(("place", "velocity", "spin", "push", "swing"), wp.vec3d) | {"turn": wp.mat33d}
+_STEPS: dict[str, Any] = dict.fromkeys(("envs", "done", "ticks", "lost", "contacts", "slides"), wp.int32) | {"length": wp.float64}
+_MOTION: dict[str, Any] = {"pose": wp.mat44d, "velocity": wp.vec3d, "spin": wp.vec3d, "push": wp.float64}
 _SLOTS: dict[str, Any] = {
     "row": wp.int32,
     "held": wp.int32,
@@ -348,6 +362,10 @@ _SLOTS: dict[str, Any] = {
     "turn": wp.vec2d,
     "place": wp.vec3d,
     "frame": wp.mat33d,
+    "bend": wp.vec2d,
+    "lift": wp.float64,
+    "compliance": wp.float64,
+    "tried": wp.vec2d,
     "wrench": wp.spatial_vectord,
     "opposite": wp.spatial_vectord,
 }

@@ -34,6 +34,37 @@ class Frames:
     """Of the origin [m/s]."""
     spin: wp.array2d(dtype=wp.vec3d)
     """[rad/s]."""
+    push: wp.array2d(dtype=wp.vec3d)
+    """Acceleration of the origin [m/s²] that everything but contacts and other constraints would give."""
+    swing: wp.array2d(dtype=wp.vec3d)
+    """Angular acceleration of the same kind [rad/s²]."""
+
+
+@wp.func
+def push_at(frames: Frames, row: wp.int32, frame: wp.int32, point: wp.vec3d) -> wp.vec3d:
+    """Free acceleration [m/s²] of a point of a body, which is given in the world frame."""
+    return frames.push[row, frame] + wp.cross(frames.swing[row, frame], point - frames.place[row, frame])
+
+
+@wp.func
+def frame_of(frames: Frames, touched: Touched, body: wp.int32) -> wp.int32:
+    """Frame of what is touched: those of the pads come first."""
+    if body < touched.bodies:
+        return frames.place.shape[1] - touched.bodies + body
+    return body - touched.bodies
+
+
+@wp.func
+def closing_push(
+    frames: Frames, touched: Touched, row: wp.int32, pad: wp.int32, body: wp.int32, point: wp.vec3d, normal: wp.vec3d
+) -> wp.float64:
+    """Acceleration [m/s²] by which a contact may close faster, at a point and along the gel's normal, world frame.
+
+    Either side may be held by other contacts, so that one that goes away does not make up for the other.
+    """
+    of_pad = wp.dot(push_at(frames, row, pad, point), normal)
+    of_body = wp.dot(push_at(frames, row, frame_of(frames, touched, body), point), normal)
+    return wp.max(of_pad, _0) + wp.max(-of_body, _0)
 
 
 @wp.func
@@ -115,7 +146,6 @@ def move_bodies(
     before: wp.array3d(dtype=wp.mat44d),
     timestep: wp.float64,
     scene_ticks: wp.int32,
-    fall: wp.float64,
     case_travel: wp.float64,
     # outputs
     motion: Motion,
@@ -126,8 +156,8 @@ def move_bodies(
     """Motion of everything relative to one pad in one environment; poses and reach of the search for bodies; empty slots.
 
     ``before`` (B, pads, bodies): poses of the last step, NaN where unknown; it becomes the present ones. ``timestep``: the scene's [s],
-    of ``scene_ticks`` ticks. ``fall``: acceleration [m/s²] that may close a gap on top of its speed. ``case_travel``: greatest travel of a
-    body beside a case in a step [m], less than the gap from which their contact is known.
+    of ``scene_ticks`` ticks. ``case_travel``: greatest travel of a body beside a case in a step [m], less than the gap from which their
+    contact is known.
     """
     row, pad = wp.tid()
     pads, bodies, env = frames.place.shape[1] - touched.bodies, touched.bodies, steps.envs[row]
@@ -135,7 +165,8 @@ def move_bodies(
     pad_velocity, pad_spin = frames.velocity[row, pad], frames.spin[row, pad]
     motion.world_from_pad[row, pad] = pose_of(frames.turn[row, pad], origin)
     left = timestep * (_1 - wp.float64(steps.done[row]) / wp.float64(scene_ticks))
-    fastest, case_step = wp.float64(0.0), wp.float64(_INF)
+    own_push, own_swing = frames.push[row, pad], wp.length(frames.swing[row, pad])
+    fastest, quickest, case_step = wp.float64(0.0), wp.float64(0.0), wp.float64(_INF)
     for body in range(bodies + pads):
         frame = pads + body
         if body >= bodies:
@@ -150,10 +181,16 @@ def move_bodies(
         motion.spin[row, pad, body] = spin
         slots.row[row, pad, body] = -1
         slots.held[row, pad, body] = 0
+        size = _1
+        if body < bodies:
+            size = wp.min(touched.radius[body], _1)
+        push = wp.length(frames.push[row, frame]) + wp.length(own_push) + own_swing * wp.length(apart)
+        push += (wp.length(frames.swing[row, frame]) + own_swing) * size
+        motion.push[row, pad, body] = push
         if body < bodies:
             radius = touched.radius[body]
             speed = wp.length(velocity) + wp.length(spin) * wp.min(radius, _1)
-            fastest = wp.max(fastest, speed)
+            fastest, quickest = wp.max(fastest, speed), wp.max(quickest, push)
             if radius < _INF:
                 outside = wp.vec3d(
                     wp.max(wp.abs(place[0] - gels.case_centre[pad][0]) - gels.case_half[pad][0], _0),
@@ -172,14 +209,14 @@ def move_bodies(
             motion.suspect[row, pad, body] = suspect
         else:
             other = body - bodies
-            size = wp.length(gels.half[pad]) + gels.thickness[pad] + wp.length(gels.half[other]) + gels.thickness[other]
+            both = wp.length(gels.half[pad]) + gels.thickness[pad] + wp.length(gels.half[other]) + gels.thickness[other]
             near = wp.int32(0)
             if other > pad and gels.carrier[pad] != gels.carrier[other]:
-                if wp.length(place) < size + wp.length(velocity) * left:
+                if wp.length(place) < both + wp.length(velocity) * left + push * left * left:
                     near = wp.int32(1)
             motion.near_gel[row, pad, other] = near
     motion.case_step[row, pad] = case_step
-    reach[row, pad] = wp.where(bodies > 0, fastest * left + fall * left * left, _0)
+    reach[row, pad] = wp.where(bodies > 0, fastest * left + quickest * left * left, _0)
     if pad == 0:
         steps.lost[row] = 0
 
@@ -200,4 +237,4 @@ def pair_of_gels(
     row = wp.tid()
     left = timestep * (_1 - wp.float64(steps.done[row]) / wp.float64(scene_ticks))
     poses[row, 0, 0] = motion.pose[row, pad, body]
-    reach[row, 0] = wp.length(motion.velocity[row, pad, body]) * left
+    reach[row, 0] = (wp.length(motion.velocity[row, pad, body]) + motion.push[row, pad, body] * left) * left

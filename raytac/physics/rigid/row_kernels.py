@@ -9,11 +9,18 @@ end of the step. So every row is a given force and a viscous one at the end of t
 | normal | F(δ) | c K (``normal_spring``) |
 | tangents | −k s, the shear's | k c, c >= Δt |
 | spin | −k s, the shear's | as of the tangents on the lever of the cone |
-| rolling | 0 | N m Δt, m the metacentric height |
+| rolling | −b | N m Δt, m the metacentric height |
+
+The convex cone lifts what slips, which the normal row's f₀ is less by: at the speed at the start of the step, unless a slide begins or ends
+in it. ``Steps.slides`` says where that may be, and MuJoCo's own solution for the end of the step decides then (``correct_lifts``).
 
 The last row replaces what a single contact point lacks. A flat face that tilts moves the centre of pressure by its spread m per radian, so
 the normal load turns it back with the stiffness N m, taken at the start of a step. That is stable with as much at its end, which the
-viscous row gives. Of a ball m is 0, and its row is the friction of rolling.
+viscous row gives. Of a ball m is 0.
+
+b is the friction of rolling, 3/16 α a N with α the gel's hysteresis. It builds up while the body rolls on by an eighth of the contact's
+radius a, by the law of P. R. Dahl (A solid friction model, 1968), which takes energy from the smallest rocking: a body that turns by
+s / a per radian over its contact, s the spread (of a ball R), has db = (b_max u − b) 8 s / a |dφ| with u the direction of the angle dφ.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -26,7 +33,7 @@ from __future__ import annotations
 import warp as wp
 
 from raytac.physics.rigid.contact_rows import Rows
-from raytac.physics.rigid.motion_kernels import place_of, turn_of
+from raytac.physics.rigid.motion_kernels import Frames, closing_push, frame_of, place_of, push_at, turn_of
 from raytac.physics.rigid.shear_kernels import begin_shear, clear_shear, move_shear
 from raytac.physics.rigid.spring_kernels import normal_spring
 from raytac.physics.rigid.step_kernels import law_of
@@ -54,7 +61,14 @@ _LEAST = wp.constant(wp.float64(1e-6))
 _LEVER = wp.constant(wp.float64(3.0 * 3.141592653589793 / 16.0))
 """Lever of the torque of spin over the contact's radius: Hertz's contact that slips as a whole."""
 _ROLLING = wp.constant(wp.float64(3.0 / 16.0))
-"""Of the friction of rolling, over radius and hysteresis."""
+"""Bound of the friction of rolling, over radius and hysteresis."""
+_GIVE = wp.constant(wp.float64(8.0))
+"""Radius of the contact over the distance on which the friction of rolling builds up."""
+_ROOM = wp.constant(wp.float64(4.0))
+"""Cone's bound of rolling over that of its friction, so that this takes 3 % at most from the friction of sliding."""
+_CHANGE = wp.constant(wp.float64(0.01))
+"""Change of a lift over the normal force from which a slide counts as one that begins or ends."""
+_NAN = wp.constant(wp.float64(float("nan")))
 _ROWS = wp.constant(wp.int32(ROWS))
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
@@ -69,6 +83,14 @@ def first_tangent(normal: wp.vec3d) -> wp.vec3d:
 
 
 @wp.func
+def rolled_on(share: wp.vec2d, angle: wp.vec2d) -> wp.vec2d:
+    """Torque of rolling over its bound after a rotation, over the angle in which it builds up."""
+    size = wp.length(angle)
+    along = angle / wp.max(size, wp.float64(1e-30))
+    return along + wp.exp(-size) * (share - along)
+
+
+@wp.func
 def wrench_of(force: wp.vec3d, torque: wp.vec3d) -> wp.spatial_vectord:
     return wp.spatial_vectord(force[0], force[1], force[2], torque[0], torque[1], torque[2])
 
@@ -80,17 +102,21 @@ def set_rows(
     bodies: wp.int32,
     first_pad: wp.int32,
     first_body: wp.int32,
+    frames: Frames,
     motion: Motion,
     vary: Differences,
     gels: Gels,
     touched: Touched,
-    fall: wp.float64,
+    rolling: wp.array3d(dtype=wp.vec2d),
     # outputs
     steps: Steps,
     shear: Shear,
     slots: Slots,
 ):
-    """Fill the slots of one search's results with the rows of the step; ``pads`` …: as of ``approach``."""
+    """Fill the slots of one search's results with the rows of the step; ``pads`` …: as of ``approach``.
+
+    ``rolling``: torques of rolling over their bounds, about the pad's tangents.
+    """
     i, p, q = wp.tid()
     pad, body = first_pad + p, first_body + q
     row = slots.row[i, pad, body]
@@ -98,13 +124,14 @@ def set_rows(
         return
     env, step = steps.envs[i], steps.length[i]
     law = law_of(rows, row, vary, gels, touched, env, pad, body)
-    spring = normal_spring(
-        rows, law, rows.depth[row], slots.speed[i, pad, body], compliance_of(vary, gels, env, pad, body), step,
-        gels.relaxation[pad], fall,
-    )  # fmt: skip
+    centre, normal, spread = rows.centre[row], rows.normal[row], rows.spread[row]
+    rotation = turn_of(motion.world_from_pad[i, pad])
+    at = rotation * centre + place_of(motion.world_from_pad[i, pad])
+    push = closing_push(frames, touched, i, pad, body, at, rotation * normal)
+    compliance = compliance_of(vary, gels, env, pad, body)
+    spring = normal_spring(rows, law, rows.depth[row], slots.speed[i, pad, body], compliance, step, gels.relaxation[pad], push)
     if not spring.damping > _0:
         return
-    centre, normal, spread = rows.centre[row], rows.normal[row], rows.spread[row]
     deepest = wp.max(spring.deepest, _0)
     radius, load = radius_at(rows, law, deepest), force_at(rows, law, deepest)[0]
     factor, square = softening(vary, gels, touched, env, pad, body), radius * radius
@@ -131,45 +158,62 @@ def set_rows(
     axes = wp.matrix_from_rows(normal, one, wp.cross(normal, one))
 
     # What MuJoCo's convex cone adds to the normal force of a contact that slips, at the speed at the start of the step. Beyond the cone,
-    # the force without it, (F, T), is projected to F + μ r (T − μF) / (1 + μ² r) with r the ratio of the dampings.
+    # the force without it, (F, T), is projected to F + μ r (T − μF) / (1 + μ² r) with r the ratio of the dampings. If the free
+    # acceleration, and its friction, make a different speed at the end, a slide begins or ends.
     spin = motion.spin[i, pad, body]
     velocity = motion.velocity[i, pad, body] + wp.cross(spin, centre - place_of(pose))
     lift = wp.float64(0.0)
     if spring.force > _0:
-        tangential = wp.vec3d(
-            pull[0] + damping * wp.dot(velocity, first),
-            pull[1] + damping * wp.dot(velocity, second),
-            pull[2] / lever + damping * wp.dot(spin, normal) * lever,
-        )
-        excess = wp.max(wp.length(tangential) - friction * spring.force, _0)
-        lift = friction * spring.damping / damping * excess
+        back, frame = wp.transpose(rotation), frame_of(frames, touched, body)
+        swing = back * (frames.swing[i, frame] - frames.swing[i, pad])
+        gain = back * (push_at(frames, i, frame, at) - push_at(frames, i, pad, at))
+        normal_load = wp.max(spring.force + spring.damping * slots.speed[i, pad, body], _0)
+        limit, per_lift = friction * normal_load, friction * spring.damping / damping
+        elastic = wp.vec3d(pull[0], pull[1], pull[2] / lever)
+        slip = wp.vec3d(wp.dot(velocity, first), wp.dot(velocity, second), wp.dot(spin, normal) * lever)
+        gained = wp.vec3d(wp.dot(gain, first), wp.dot(gain, second), wp.dot(swing, normal) * lever)
+        lift = per_lift * wp.max(wp.length(elastic + damping * slip) - limit, _0)
+        free = wp.length(elastic + damping * (slip + step * gained)) - limit * (_1 + damping * step * compliance)
+        if wp.abs(per_lift * wp.max(free, _0) - lift) > _CHANGE * spring.force:
+            steps.slides[i] = 1
 
-    rotation = turn_of(motion.world_from_pad[i, pad])
     slots.held[i, pad, body] = 1
     wp.atomic_add(steps.contacts, i, 1)
     slots.centre[i, pad, body] = centre
     slots.radius[i, pad, body] = radius
     slots.axes[i, pad, body] = axes
     slots.turn[i, pad, body] = wp.vec2d(cos, sin)
-    slots.place[i, pad, body] = rotation * centre + place_of(motion.world_from_pad[i, pad])
+    slots.place[i, pad, body] = at
     slots.frame[i, pad, body] = axes * wp.transpose(rotation)
     slots.friction[i, pad, body, 0] = friction
     slots.friction[i, pad, body, 1] = friction
     slots.friction[i, pad, body, 2] = friction * lever
+    # The friction of rolling at the end of the step, by the spin at its start; what damps it does not act on that spin.
+    held, spins = rolling[env, pad, body], wp.vec2d(wp.dot(spin, axes[1]), wp.dot(spin, axes[2]))
+    spreads, plastic = wp.vec2d(wp.max(mean - half, _0), mean + half), _ROLLING * gels.hysteresis[pad]
+    bend = _GIVE / wp.max(radius, _LEAST) * spreads
+    share = rolled_on(wp.vec2d(cos * held[0] + sin * held[1], cos * held[1] - sin * held[0]), step * wp.cw_mul(bend, spins))
+    torque = plastic * radius * load * share
+    slots.bend[i, pad, body] = bend
+    per_square = damping / wp.pow(wp.max(friction, _LEAST), _2)
     k = wp.int32(0)
     while k < 2:  # a rotation about one tangent moves the centre along the other
-        metacentric = wp.max(mean + wp.where(k == 0, -half, half) - height, _0)
-        rolling = friction * wp.sqrt(load * step / damping * metacentric)
+        metacentric = wp.max(spreads[k] - height, _0)
         # The cone must not cut this row before the centre of pressure is near the edge.
-        rolling = wp.max(rolling, _EDGE * radius * metacentric / (metacentric + wp.abs(height) + wp.float64(1e-9)))
-        slots.friction[i, pad, body, 3 + k] = wp.max(rolling, _ROLLING * gels.hysteresis[pad] * radius)
+        edge = _EDGE * radius * metacentric / (metacentric + wp.abs(height) + wp.float64(1e-9))
+        tilt = wp.max(friction * wp.sqrt(load * step / damping * metacentric), edge)
+        whole = friction * wp.sqrt(load * step / damping * (metacentric + _GIVE * plastic * spreads[k]))
+        whole = wp.max(wp.max(tilt, whole), _ROOM * plastic * radius)
+        slots.friction[i, pad, body, 3 + k] = whole
+        slots.force[i, pad, body, 4 + k] = per_square * (whole * whole - tilt * tilt) * spins[k] - torque[k]
         k += 1
+    slots.lift[i, pad, body] = lift
+    slots.compliance[i, pad, body] = compliance
+    slots.tried[i, pad, body] = wp.vec2d(_NAN, _NAN)
     slots.force[i, pad, body, 0] = spring.force - lift
     slots.force[i, pad, body, 1] = -(cos * pull[0] + sin * pull[1])
     slots.force[i, pad, body, 2] = sin * pull[0] - cos * pull[1]
     slots.force[i, pad, body, 3] = -pull[2]
-    slots.force[i, pad, body, 4] = _0
-    slots.force[i, pad, body, 5] = _0
     # Those of spin and rolling follow from the cone's levers.
     slots.regularisation[i, pad, body, 0] = _1 / (spring.damping * step)
     k = wp.int32(0)
@@ -188,6 +232,7 @@ def read_rows(
     touched: Touched,
     # outputs
     shear: Shear,
+    rolling: wp.array3d(dtype=wp.vec2d),
     acceleration: wp.array3d(dtype=wp.float64),
     slots: Slots,
 ):
@@ -206,6 +251,7 @@ def read_rows(
         if shear.stiffness[env, pad, body][0] > _0:
             clear_shear(shear, env, pad, body)
             acceleration[env, pad, body] = _0
+            rolling[env, pad, body] = wp.vec2d()
         return
     turn, centre, axes = slots.turn[i, pad, body], slots.centre[i, pad, body], slots.axes[i, pad, body]
     one, two = velocity[i, pad, body, 1] * step, velocity[i, pad, body, 2] * step
@@ -213,6 +259,10 @@ def read_rows(
     normal_load = force[i, pad, body, 0]
     limit = wp.vec2d(normal_load * slots.friction[i, pad, body, 0], normal_load * slots.friction[i, pad, body, 2])
     move_shear(shear, env, pad, body, displacement, limit, centre, slots.radius[i, pad, body])
+    bend = slots.bend[i, pad, body]
+    one, two = velocity[i, pad, body, 4] * step * bend[0], velocity[i, pad, body, 5] * step * bend[1]
+    angle = wp.vec2d(turn[0] * one - turn[1] * two, turn[1] * one + turn[0] * two)
+    rolling[env, pad, body] = rolled_on(rolling[env, pad, body], angle)
     acceleration[env, pad, body] = (-velocity[i, pad, body, 0] - slots.speed[i, pad, body]) / step
     back = wp.transpose(axes)
     push = -(back * wp.vec3d(normal_load, force[i, pad, body, 1], force[i, pad, body, 2]))

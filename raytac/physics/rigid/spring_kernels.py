@@ -44,7 +44,7 @@ class Spring:
     damping: wp.float64
     """C [N s/m]; 0 where no contact is possible in this step."""
     deepest: wp.float64
-    """Depth [m] to which a free pair of bodies would close in the step."""
+    """Depth [m] to which a free pair of bodies would close in the step; of one that touches, at its speed alone."""
 
 
 @wp.func
@@ -65,8 +65,10 @@ def end_of_step(
     step: wp.float64,
     relaxation: wp.float64,
 ) -> wp.float64:
-    """Depth [m] to which free bodies close in the step: m (v − w) / Δt = f(w) by bisection, f rising in w."""
-    low, high = wp.float64(0.0), wp.max(quickest, _0)
+    """Depth [m] to which free bodies close in the step: m (v − w) / Δt = f(w) by bisection, f rising in w from ``start`` on."""
+    low, high = wp.float64(0.0), wp.max(quickest - step * inverse_mass * start, _0)
+    if step * high <= _SLOW:
+        return depth + step * high
     k = wp.int32(0)
     while k < _HALVINGS:
         middle = _HALF * (low + high)
@@ -91,7 +93,7 @@ def normal_spring(
     inverse_mass: wp.float64,
     step: wp.float64,
     relaxation: wp.float64,
-    fall: wp.float64,
+    push: wp.float64,
 ) -> Spring:
     """Spring of one step of a contact.
 
@@ -102,12 +104,10 @@ def normal_spring(
         inverse_mass: 1/m of both bodies [1/kg].
         step: Δt [s].
         relaxation: τ [s] of the gel.
-        fall: acceleration [m/s²] that may close a gap on top of its speed.
+        push: acceleration [m/s²] that may close it faster, but for its own force.
     """
     start = force_at(rows, law, depth)
-    quickest = speed
-    if depth <= _0:
-        quickest += fall * step
+    quickest = speed + push * step
     end = depth + step * wp.max(quickest, _0)
     if end > wp.max(depth, _0) + _SLOW:
         end = end_of_step(rows, law, depth, quickest, start[0], inverse_mass, step, relaxation)
@@ -121,6 +121,11 @@ def normal_spring(
             result.damping = secant * step
     else:
         stiffness = wp.max(at[1], start[1])
+        # What other contacts hold does not follow its push: at rest radius and friction are those of the present depth.
+        if push > _0:
+            result.deepest = depth
+            if step * speed > _SLOW:
+                result.deepest = end_of_step(rows, law, depth, speed, start[0], inverse_mass, step, relaxation)
         result.force = start[0]
         result.damping = stiffness * spring_time(stiffness, inverse_mass, step, relaxation)
     return result

@@ -151,3 +151,4 @@ def choose_steps(motion: Motion, slots: Slots, timestep: wp.float64, scene_ticks
     steps.ticks[i] = ticks
     steps.length[i] = timestep * wp.float64(ticks) / wp.float64(scene_ticks)
     steps.contacts[i] = 0
+    steps.slides[i] = 0

@@ -86,6 +86,8 @@ class Motion:
     """Of bodies' origins relative to the pad [m/s], pad frame."""
     spin: wp.array3d(dtype=wp.vec3d)
     """Relative to the pad [rad/s]."""
+    push: wp.array3d(dtype=wp.float64)
+    """Greatest free acceleration of any point of a body against any of the pad [m/s²]."""
     case_step: wp.array2d(dtype=wp.float64)
     """Longest step [s] in which no body's ball enters the case far, (n, pads)."""
     before: wp.array3d(dtype=wp.mat44d)
@@ -125,6 +127,14 @@ class Slots:
     """f₀ [N, N m], (…, ROWS)."""
     regularisation: wp.array4d(dtype=wp.float64)
     """R, (…, ROWS)."""
+    bend: wp.array3d(dtype=wp.vec2d)
+    """Share of the torque of rolling that builds up per angle about each tangent of the row [1/rad]."""
+    lift: wp.array3d(dtype=wp.float64)
+    """Normal force that MuJoCo's cone adds, which f₀ is without [N]."""
+    compliance: wp.array3d(dtype=wp.float64)
+    """1/m of both bodies [1/kg]."""
+    tried: wp.array3d(dtype=wp.vec2d)
+    """Lift that was tried before, and by how much it was too small [N]; NaN at first."""
     wrench: wp.array3d(dtype=wp.spatial_vectord)
     """Force and torque on the pad, about its origin."""
     opposite: wp.array3d(dtype=wp.spatial_vectord)
@@ -147,6 +157,8 @@ class Steps:
     """1 where physics broke down."""
     contacts: wp.array(dtype=wp.int32)
     """Contacts of gels that are held."""
+    slides: wp.array(dtype=wp.int32)
+    """1 where a contact may begin or end to slide in this step, so that its lift is not known yet."""
 
 
 @wp.struct

@@ -38,6 +38,10 @@ class PadRows:
     """G [N s/m, N m s] of normal and tangents, (n, 2)."""
     step: np.ndarray
     """Δt [s], (n,)."""
+    slides: np.ndarray
+    """True (n,) where a slide may begin or end in the step."""
+    bend: np.ndarray
+    """Share of the torque of rolling that builds up per angle about each tangent, (n, 2)."""
 
     def regularisation(self) -> np.ndarray:
         """R, (n, 6): those of spin and rolling follow from the cone's levers."""
@@ -69,6 +73,9 @@ def gel_rows(
     softer: np.ndarray,
     friction: np.ndarray,
     mass_centre: np.ndarray,
+    gain: np.ndarray,
+    compliance: np.ndarray,
+    rolling: np.ndarray,
 ) -> tuple[PadRows, np.ndarray]:
     """Rows of n contacts, and the matrices (n, 2, 2) from their tangents to the pad's (``tangents``).
 
@@ -81,6 +88,9 @@ def gel_rows(
         softer: factors of the gels' moduli, (n,).
         friction: Coulomb's coefficients, (n,).
         mass_centre: of what is touched, in its frame [m], (bodies, 3).
+        gain: free acceleration of the body over the gel where they touch, and its angular one, pad frame, (n, 6).
+        compliance: 1/m of both bodies [1/kg], (n,).
+        rolling: torques of rolling over their bounds, about the pad's tangents, (n, 2).
     """
     at = contacts.env, contacts.pad, contacts.body
     deepest = np.maximum(spring.deepest, 0.0)
@@ -98,26 +108,49 @@ def gel_rows(
     # As much at the end of a step as keeps both shear and spin stable, whatever its length.
     time = np.maximum(tau, step * np.maximum(1.0, stiffness[:, 1] / (stiffness[:, 0] * lever**2)))
     damping = stiffness[:, 0] * time
-    metacentric, height, turn = _tilt(contacts, motion, row, mass_centre)
-    rolling = friction[:, None] * np.sqrt((load * step / damping)[:, None] * metacentric)
+    spread, height, turn = _tilt(contacts, motion, row, mass_centre)
+    metacentric = np.maximum(spread - height[:, None], 0.0)
+    per_square = (load * step / damping)[:, None]
+    tilt = friction[:, None] * np.sqrt(per_square * metacentric)
     # The cone must not cut this row before the centre of pressure is near the edge.
-    rolling = np.maximum(rolling, _EDGE * radius[:, None] * metacentric / (metacentric + np.abs(height)[:, None] + 1e-9))
-    rolling = np.maximum(rolling, 3.0 / 16.0 * (hysteresis * radius)[:, None])
+    tilt = np.maximum(tilt, _EDGE * radius[:, None] * metacentric / (metacentric + np.abs(height)[:, None] + 1e-9))
+    plastic = 3.0 / 16.0 * hysteresis[:, None]
+    whole = np.maximum(tilt, friction[:, None] * np.sqrt(per_square * (metacentric + 8.0 * plastic * spread)))
+    whole = np.maximum(whole, 4.0 * plastic * radius[:, None])
     pull = shear.begin(at, stiffness, contacts.centre)
     force = np.zeros((len(contacts), ROWS))
-    force[:, 0] = spring.force - _lift(contacts, spring, motion, row, friction, lever, damping, pull)
+    lift, slides = _lift(contacts, spring, motion, row, step, friction, lever, damping, pull, gain, compliance)
+    force[:, 0] = spring.force - lift
     force[:, 1:3] = -(pull[:, None, :2] @ turn)[:, 0]
     force[:, 3] = -pull[:, 2]
-    rotation, origin = motion.world_from_pad[row, contacts.pad, :3, :3], motion.world_from_pad[row, contacts.pad, :3, 3]
     axes = row_axes(contacts.normal, turn)
+    spin = (axes[:, 1:] @ motion.spin[at_rows(contacts, row)][..., None])[..., 0]
+    bend = 8.0 * spread / np.maximum(radius, 1e-6)[:, None]
+    share = rolled_on((rolling[:, None] @ turn)[:, 0], step[:, None] * bend * spin)
+    force[:, 4:] = (damping / friction**2)[:, None] * (whole**2 - tilt**2) * spin - plastic * (radius * load)[:, None] * share
+    rotation, origin = motion.world_from_pad[row, contacts.pad, :3, :3], motion.world_from_pad[row, contacts.pad, :3, 3]
     return PadRows(
         (rotation @ contacts.centre[..., None])[..., 0] + origin,
         (axes @ np.swapaxes(rotation, 1, 2)).reshape(-1, 9),
-        np.stack([friction, friction, friction * lever, rolling[:, 0], rolling[:, 1]], axis=1),
+        np.stack([friction, friction, friction * lever, whole[:, 0], whole[:, 1]], axis=1),
         force,
         np.stack([spring.damping, damping], axis=1),
         step,
+        slides,
+        bend,
     ), turn
+
+
+def at_rows(contacts: PadContacts, row: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Entries of contacts in the arrays of motion."""
+    return row, contacts.pad, contacts.body
+
+
+def rolled_on(share: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Torques (n, 2) of rolling over their bounds after rotations (n, 2), over the angle in which they build up: Dahl's law."""
+    size = np.linalg.norm(angle, axis=1)[:, None]
+    along = angle / np.maximum(size, 1e-30)
+    return along + np.exp(-size) * (share - along)
 
 
 def row_axes(normal: np.ndarray, turn: np.ndarray) -> np.ndarray:
@@ -132,12 +165,16 @@ def _lift(
     spring: NormalSpring,
     motion: PadMotion,
     row: np.ndarray,
+    step: np.ndarray,
     friction: np.ndarray,
     lever: np.ndarray,
     damping: np.ndarray,
     pull: np.ndarray,
-) -> np.ndarray:
-    """Normal force (n,) that MuJoCo's convex cone adds to contacts that slip, at the speed at the start of the step.
+    gain: np.ndarray,
+    compliance: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal force (n,) that MuJoCo's convex cone adds to contacts that slip, at the speed at the start of the step; and whether the
+    free acceleration changes it by more than a hundredth of the load.
 
     Beyond the cone, the force without it, (F, T), is projected to F + μ r (T − μF) / (1 + μ² r) with r the ratio of the dampings.
     """
@@ -145,18 +182,24 @@ def _lift(
     arm = contacts.centre - motion.pad_from_body[at][:, :3, 3]
     velocity = motion.velocity[at] + cross(motion.spin[at], arm)
     one, two = tangents(contacts.normal)
-    slip = np.stack([np.vecdot(velocity, one), np.vecdot(velocity, two)], axis=1)
-    spin = np.vecdot(motion.spin[at], contacts.normal)
-    tangential = pull[:, :2] + damping[:, None] * slip
-    torque = pull[:, 2] / lever + damping * spin * lever
-    excess = np.sqrt(np.vecdot(tangential, tangential) + torque**2) - friction * np.maximum(spring.force, 0.0)
-    return np.where(spring.force > 0.0, friction * spring.damping / damping * np.maximum(excess, 0.0), 0.0)
+    load = np.maximum(spring.force + spring.damping * -np.vecdot(velocity, contacts.normal), 0.0)
+
+    def excess(velocity: np.ndarray, spin: np.ndarray, share: np.ndarray) -> np.ndarray:
+        slip = np.stack([np.vecdot(velocity, one), np.vecdot(velocity, two)], axis=1)
+        tangential = pull[:, :2] + damping[:, None] * slip
+        torque = pull[:, 2] / lever + damping * np.vecdot(spin, contacts.normal) * lever
+        over = np.sqrt(np.vecdot(tangential, tangential) + torque**2) - share * friction * load
+        return np.where(spring.force > 0.0, friction * spring.damping / damping * np.maximum(over, 0.0), 0.0)
+
+    ends = velocity + step[:, None] * gain[:, :3], motion.spin[at] + step[:, None] * gain[:, 3:]
+    lift, free = excess(velocity, motion.spin[at], np.ones_like(load)), excess(*ends, 1.0 + damping * step * compliance)
+    return lift, np.abs(free - lift) > 0.01 * np.maximum(spring.force, 0.0)
 
 
 def _tilt(
     contacts: PadContacts, motion: PadMotion, row: np.ndarray, mass_centre: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Metacentric heights (n, 2) [m] for rotations about two principal tangents, the height of the centre of mass (n,), and these
+    """Spreads (n, 2) [m] for rotations about two principal tangents, the height of the centre of mass (n,), and these
     tangents by the pad's, (n, 2, 2).
 
     The centre of pressure of a body that turns about its centre of mass moves by the spread of the overlap per radian, less the
@@ -171,5 +214,5 @@ def _tilt(
     cos, sin = np.cos(angle), np.sin(angle)
     turn = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
     # A rotation about one tangent moves the centre along the other.
-    spread = np.stack([mean - half, mean + half], axis=1)
-    return np.maximum(spread - height[:, None], 0.0), height, turn
+    spread = np.maximum(np.stack([mean - half, mean + half], axis=1), 0.0)
+    return spread, height, turn

@@ -37,7 +37,7 @@ def normal_spring(
     inverse_mass: np.ndarray,
     step: np.ndarray,
     relaxation: np.ndarray,
-    fall: float,
+    push: np.ndarray,
 ) -> NormalSpring:
     """Spring of one step of n contacts.
 
@@ -48,25 +48,37 @@ def normal_spring(
         inverse_mass: 1/m of both bodies [1/kg].
         step: Δt [s].
         relaxation: τ [s] of the gel.
-        fall: acceleration [m/s²] that may close a gap on top of its speed.
+        push: acceleration [m/s²] that may close it faster, but for its own force.
     """
     gap = depth <= 0.0
     start, slope = law.force(depth)
-    quickest = np.where(gap, speed + fall * step, speed)
-    reach = depth + step * np.maximum(quickest, 0.0)
-    end = reach
-    some = np.flatnonzero(reach > np.maximum(depth, 0.0) + 1e-7)
-    if len(some):
-        end = reach.copy()
-        end[some] = _end(
-            law_of(law, some), depth[some], quickest[some], start[some], inverse_mass[some], step[some], relaxation[some]
-        )
+    end, slow = (_reached(law, depth, quick, start, inverse_mass, step, relaxation) for quick in (speed + push * step, speed))
+    deepest = np.where(gap, end, np.where(push > 0.0, np.where(step * speed > 1e-7, slow, depth), end))
     force, stiffness = law.force(np.maximum(end, 0.0))
     secant = force / np.where(end > 0.0, end, 1.0)
     stiffness = np.maximum(stiffness, slope)
     touching = stiffness * _time(stiffness, inverse_mass, step, relaxation)
     closing = np.where(end > 0.0, secant * step, 0.0)
-    return NormalSpring(np.where(gap, secant * depth, start), np.where(gap, closing, touching), end)
+    return NormalSpring(np.where(gap, secant * depth, start), np.where(gap, closing, touching), deepest)
+
+
+def _reached(
+    law: LoadTables,
+    depth: np.ndarray,
+    quickest: np.ndarray,
+    start: np.ndarray,
+    inverse_mass: np.ndarray,
+    step: np.ndarray,
+    relaxation: np.ndarray,
+) -> np.ndarray:
+    """Depths (n,) [m] at the end of the step of contacts that close at speeds ``quickest`` (n,) but for their own force."""
+    end = depth + step * np.maximum(quickest, 0.0)
+    some = np.flatnonzero(end > np.maximum(depth, 0.0) + 1e-7)
+    if len(some):
+        end[some] = _end(
+            law_of(law, some), depth[some], quickest[some], start[some], inverse_mass[some], step[some], relaxation[some]
+        )
+    return end
 
 
 def _end(
@@ -79,14 +91,15 @@ def _end(
     relaxation: np.ndarray,
 ) -> np.ndarray:
     """Depths (n,) [m] to which free bodies close in the step: m (v − w) / Δt = f(w) by bisection, f rising in w."""
-    gap, low, high = depth <= 0.0, np.zeros_like(depth), np.maximum(quickest, 0.0)
+    gap, low, high = depth <= 0.0, np.zeros_like(depth), np.maximum(quickest - step * inverse_mass * start, 0.0)
+    slow, most = step * high <= 1e-7, high
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         force, stiffness = law.force(depth + step * middle)
         force = np.where(gap, force, start + stiffness * _time(stiffness, inverse_mass, step, relaxation) * middle)
         above = (quickest - middle) < step * inverse_mass * force
         low, high = np.where(above, low, middle), np.where(above, middle, high)
-    return depth + step * high
+    return depth + step * np.where(slow, most, high)
 
 
 def _time(stiffness: np.ndarray, inverse_mass: np.ndarray, step: np.ndarray, relaxation: np.ndarray) -> np.ndarray:
