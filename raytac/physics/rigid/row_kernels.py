@@ -19,8 +19,9 @@ the normal load turns it back with the stiffness N m, taken at the start of a st
 viscous row gives. Of a ball m is 0.
 
 b is the friction of rolling, 3/16 α a N with α the gel's hysteresis. It builds up while the body rolls on by an eighth of the contact's
-radius a, by the law of P. R. Dahl (A solid friction model, 1968), which takes energy from the smallest rocking: a body that turns by
-s / a per radian over its contact, s the spread (of a ball R), has db = (b_max u − b) 8 s / a |dφ| with u the direction of the angle dφ.
+radius a, by the law of P. R. Dahl (A solid friction model, 1968), which takes energy from the smallest rocking: a body whose
+contact moves by r per radian has db = (b_max u − b) 8 r / a |dφ| with u the direction of the angle dφ. r is the lesser
+of the spread s and the height of the centre of mass: R of a ball. A flat face, which tilts rather than rolls, has only r / s of the torque.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -191,7 +192,8 @@ def set_rows(
     # The friction of rolling at the end of the step, by the spin at its start; what damps it does not act on that spin.
     held, spins = rolling[env, pad, body], wp.vec2d(wp.dot(spin, axes[1]), wp.dot(spin, axes[2]))
     spreads, plastic = wp.vec2d(wp.max(mean - half, _0), mean + half), _ROLLING * gels.hysteresis[pad]
-    bend = _GIVE / wp.max(radius, _LEAST) * spreads
+    arms = wp.vec2d(wp.min(spreads[0], wp.abs(height)), wp.min(spreads[1], wp.abs(height)))
+    bend = _GIVE / wp.max(radius, _LEAST) * arms
     share = rolled_on(wp.vec2d(cos * held[0] + sin * held[1], cos * held[1] - sin * held[0]), step * wp.cw_mul(bend, spins))
     torque = plastic * radius * load * share
     slots.bend[i, pad, body] = bend
@@ -202,10 +204,12 @@ def set_rows(
         # The cone must not cut this row before the centre of pressure is near the edge.
         edge = _EDGE * radius * metacentric / (metacentric + wp.abs(height) + wp.float64(1e-9))
         tilt = wp.max(friction * wp.sqrt(load * step / damping * metacentric), edge)
-        whole = friction * wp.sqrt(load * step / damping * (metacentric + _GIVE * plastic * spreads[k]))
+        whole = friction * wp.sqrt(load * step / damping * (metacentric + _GIVE * plastic * arms[k]))
         whole = wp.max(wp.max(tilt, whole), _ROOM * plastic * radius)
         slots.friction[i, pad, body, 3 + k] = whole
-        slots.force[i, pad, body, 4 + k] = per_square * (whole * whole - tilt * tilt) * spins[k] - torque[k]
+        slots.force[i, pad, body, 4 + k] = per_square * (whole * whole - tilt * tilt) * spins[k] - torque[k] * arms[k] / wp.max(
+            spreads[k], _LEAST
+        )
         k += 1
     slots.lift[i, pad, body] = lift
     slots.compliance[i, pad, body] = compliance

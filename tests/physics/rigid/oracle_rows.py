@@ -114,8 +114,9 @@ def gel_rows(
     tilt = friction[:, None] * np.sqrt(per_square * metacentric)
     # The cone must not cut this row before the centre of pressure is near the edge.
     tilt = np.maximum(tilt, _EDGE * radius[:, None] * metacentric / (metacentric + np.abs(height)[:, None] + 1e-9))
+    arm = np.minimum(spread, np.abs(height)[:, None])
     plastic = 3.0 / 16.0 * hysteresis[:, None]
-    whole = np.maximum(tilt, friction[:, None] * np.sqrt(per_square * (metacentric + 8.0 * plastic * spread)))
+    whole = np.maximum(tilt, friction[:, None] * np.sqrt(per_square * (metacentric + 8.0 * plastic * arm)))
     whole = np.maximum(whole, 4.0 * plastic * radius[:, None])
     pull = shear.begin(at, stiffness, contacts.centre)
     force = np.zeros((len(contacts), ROWS))
@@ -125,9 +126,11 @@ def gel_rows(
     force[:, 3] = -pull[:, 2]
     axes = row_axes(contacts.normal, turn)
     spin = (axes[:, 1:] @ motion.spin[at_rows(contacts, row)][..., None])[..., 0]
-    bend = 8.0 * spread / np.maximum(radius, 1e-6)[:, None]
+    bend = 8.0 * arm / np.maximum(radius, 1e-6)[:, None]
     share = rolled_on((rolling[:, None] @ turn)[:, 0], step[:, None] * bend * spin)
-    force[:, 4:] = (damping / friction**2)[:, None] * (whole**2 - tilt**2) * spin - plastic * (radius * load)[:, None] * share
+    force[:, 4:] = (damping / friction**2)[:, None] * (whole**2 - tilt**2) * spin - plastic * (radius * load)[
+        :, None
+    ] * share * arm / np.maximum(spread, 1e-6)
     rotation, origin = motion.world_from_pad[row, contacts.pad, :3, :3], motion.world_from_pad[row, contacts.pad, :3, 3]
     return PadRows(
         (rotation @ contacts.centre[..., None])[..., 0] + origin,

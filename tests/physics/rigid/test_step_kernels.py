@@ -335,7 +335,8 @@ def test_a_step_of_the_kernels_is_that_of_numpy(seed: int) -> None:
     same(slots["frame"][step.slot].reshape(-1, 9), rows.frame, 1e-10)  # principal axes of a spread that is nearly round
     same(slots["friction"][step.slot], rows.friction, 1e-10)
     for k in range(6):
-        same(slots["force"][step.slot][:, k], rows.force[:, k], 1e-10)
+        # The viscosity of rolling is a small difference from that of tilt.
+        same(slots["force"][step.slot][:, k], rows.force[:, k], 1e-10 if k < 4 else 1e-5)
         same(slots["regularisation"][step.slot][:, k], rows.regularisation()[:, k], 1e-10)
 
     rng = np.random.default_rng(seed)
