@@ -44,13 +44,16 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 PITCHES = 1.6e-3, 0.8e-3, 0.4e-3, 0.2e-3, 0.1e-3, 0.05e-3
 """Spacings of the nodes [m]: a contact is measured on the first grid of which it covers enough nodes, but not on the coarsest, which only
-says where a convex body may touch. The last two are for bodies that are narrower there than two cells of the one before."""
+says where a convex body may touch. The last two are for bodies that are narrow there: 20 cells of
+the one before if they are convex, else two."""
 ENOUGH = 150
 """Nodes: 96 mm² of the second grid, 24 mm² of the third."""
 _ENOUGH = wp.constant(wp.int32(ENOUGH))
 _FIRST, _LAST = wp.constant(wp.int32(1)), wp.constant(wp.int32(LAST))
 """First and last grid on which bodies that are not narrow are measured."""
 _FINEST = wp.constant(wp.int32(len(PITCHES) - 1))
+_NARROW = wp.constant(wp.float64(0.05))
+"""A grid's spacing over a convex body's least width at most, so that the area of a pin is known."""
 _NEAR = wp.constant(wp.float64(0.75))
 """Between nodes that all stay this share of the spacing from the gel a body does not touch: a cone of 45° would reach 0.71 further."""
 _CLOSE = wp.constant(wp.float64(1e-6))
@@ -117,15 +120,15 @@ def measure_pair(
     # Nodes up to there are counted by the law.
     deeper = (_HALF * DEEPER - wp.float64(1.0)) * wp.min(highest - bottom, thickness)
     clear = wp.max(reach, deeper)
+    convex = is_convex(shapes, placed, block)
     last = wp.int32(_LAST)
-    while last < _FINEST and pads.pitch[last] > _HALF * width[0]:
+    while last < _FINEST and pads.pitch[last] > wp.where(convex, _NARROW, _HALF) * width[0]:
         last += 1
     lowest = infinity()  # of the body over the pad
     if bottom < bond:
-        lowest = pierced_at(shapes, pads, placed, block, lane, lanes, pad, last)
+        lowest = pierced_at(shapes, pads, placed, block, lane, lanes, pad, _LAST)
     pierced = lowest < _INF
 
-    convex = is_convex(shapes, placed, block)
     mode, level, touching = wp.int32(_SEARCH), wp.int32(_FIRST), wp.int32(0)
     if convex and pads.pitch[0] <= _HALF * wp.min(width[0], width[1]):
         level = 0

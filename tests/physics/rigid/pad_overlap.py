@@ -10,13 +10,16 @@ import numpy as np
 from raytac.gel.surface import make_grid
 from raytac.physics.rigid.load_law import LoadLaw
 from raytac.shapes.part import Part
+from raytac.shapes.primitives import bounds
 from raytac.shapes.underside import object_height
 from raytac.specs.sensor import GelpadSpec
 
-__all__ = ["PadOverlap", "Touches", "refined"]
+__all__ = ["PadOverlap", "Touches", "least_width", "refined"]
 
 _PITCHES = 0.8e-3, 0.4e-3, 0.2e-3
-"""Spacings of the nodes [m]: a contact is measured on the first grid of which it covers enough nodes, else on the last."""
+"""Spacings of the nodes [m]: a contact is measured on the first grid of which it covers enough nodes, else on the last …"""
+_FINER = 0.1e-3, 0.05e-3
+"""… which is one of these if the body is convex and narrower than 20 cells of the one before."""
 _ENOUGH = 150
 """Nodes: 96 mm² of the first grid, 24 mm² of the second."""
 _NEAR = 0.75
@@ -53,13 +56,36 @@ class Touches:
         return 2.0 * float(self.depth[k] + self.clear[k])
 
 
+def least_width(parts: Sequence[Part], pose: np.ndarray) -> float:
+    """Least width [m] of the outline of a convex primitive's own box as seen along z, square to one of its edges; inf of other bodies."""
+    result = np.inf
+    if len(parts) > 1:
+        return result
+    for part in parts:
+        if part.kind in ("plane", "torus") or part.vertices is not None:
+            continue
+        low, high = bounds(part.kind, part.size, np.eye(4))
+        half = 0.5 * (high - low)
+        edges = half[:, None] * (pose[:3, :3] @ part.object_from_part[:3, :3])[:2].T
+        for edge in edges:
+            length = np.hypot(*edge)
+            if length > 1e-9:
+                result = min(result, float(2.0 * np.abs(edge[0] * edges[:, 1] - edge[1] * edges[:, 0]).sum() / length))
+    return result
+
+
 class PadOverlap:
     """One pad at rest, with which bodies are overlapped."""
 
-    def __init__(self, gelpad: GelpadSpec) -> None:
+    def __init__(self, gelpad: GelpadSpec, width: float = np.inf) -> None:
+        """``width`` [m]: of the narrowest body."""
         self._gelpad = gelpad
+        pitches = list(_PITCHES)
+        for finer in _FINER:
+            if pitches[-1] > 0.05 * width:
+                pitches.append(finer)
         # Who does not reach the gel on the last grid does not touch it.
-        self._grids = [_Nodes(gelpad, pitch, _NEAR * pitch if pitch > _PITCHES[-1] else 0.0) for pitch in _PITCHES]
+        self._grids = [_Nodes(gelpad, pitch, _NEAR * pitch if pitch > pitches[-1] else 0.0) for pitch in pitches]
         self.highest = self._grids[-1].highest
 
     def touches(self, parts: Sequence[Part], pad_from_body: np.ndarray, radius: float) -> Touches:
@@ -80,7 +106,7 @@ class PadOverlap:
                     count = np.count_nonzero(gaps.values < 0.0, axis=(1, 2))
                     done = count >= _ENOUGH
                     # With half the spacing there are four times as many nodes: of few, at most half of enough.
-                    on = np.where(count < _ENOUGH // 8, last, k + 1)
+                    on = np.where(count < _ENOUGH // 8, max(k + 1, len(_PITCHES) - 1), k + 1)
                     following[rows_of] = np.where(done | (gaps.least >= nodes.near), -1, on)
                 if done.any():
                     by_grid.append(nodes.measure(gaps, rows_of, done))
