@@ -28,9 +28,9 @@ class PadSearch:
     """Contacts of the pads and bodies of a world.
 
     The overlap of a resting pad and a body's underside is measured on nodes in the pad's frame: on the first grid (spacing 0.8, 0.4,
-    0.2 mm) of which it covers 150 nodes, else on the last; parabolas between the nodes refine its depth. Convex bodies that are narrower
-    than 20 cells of the last grid as seen along z, others than two, are measured on finer ones, down to 0.05 mm. The gap of a body that does not touch is measured
-    likewise.
+    0.2 mm) of which it covers 150 nodes, else on the last; parabolas between the nodes refine its depth. Bodies that are narrow as seen
+    along z, convex ones than 20 cells of the last grid and others than two, are measured on finer ones, down to 0.05 mm. The gap of a
+    body that does not touch is measured likewise.
 
     ``poses`` (environments, pads, bodies) of 4 × 4 matrices ``pad_from_body``, ``reach`` (environments, pads) [m] and ``rows`` are Warp
     arrays on the device. ``launch`` works on them without the host, so that it can be recorded in a CUDA graph; ``contacts`` copies from
