@@ -277,7 +277,7 @@ def row_times(memory: Memory, env: wp.int32, row: wp.int32, values: wp.array(dty
 
 @wp.kernel
 def correct_lifts(memory: Memory, steps: Steps, slots: Slots):
-    """Set the lifts in environments with a slide that begins or ends by the speeds that MuJoCo has just found for the end of the step.
+    """Set the lifts in environments with a slide that begins or ends by the speeds of MuJoCo for the end of the step.
 
     A slide that is faster by a lift that is larger asks for more: the first guess follows from the contact's own mass, the others by
     secants. ``steps.slides`` stays 1 until the lift fits.
@@ -288,7 +288,7 @@ def correct_lifts(memory: Memory, steps: Steps, slots: Slots):
     env, step = steps.envs[i], steps.length[i]
     before = doubles(memory, env, memory.efc_vel)
     reference = doubles(memory, env, memory.efc_aref)
-    found = doubles(memory, env, memory.qacc)
+    acceleration = doubles(memory, env, memory.qacc)
     row = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
     slides = wp.int32(0)
     for pad in range(slots.held.shape[1]):
@@ -297,12 +297,12 @@ def correct_lifts(memory: Memory, steps: Steps, slots: Slots):
                 lift = slots.lift[i, pad, body]
                 regular, sheared = slots.regularisation[i, pad, body, 0], slots.regularisation[i, pad, body, 1]
                 friction, ratio = wp.max(slots.friction[i, pad, body, 0], _LEAST), sheared / regular
-                ahead = before[row] + step * row_times(memory, env, row, found)
+                ahead = before[row] + step * row_times(memory, env, row, acceleration)
                 normal = wp.max(slots.force[i, pad, body, 0] + lift - ahead / (regular * step), _0)
                 total = wp.float64(0.0)
                 m = wp.int32(1)
                 while m < _ROWS:
-                    ahead = before[row + m] + step * row_times(memory, env, row + m, found)
+                    ahead = before[row + m] + step * row_times(memory, env, row + m, acceleration)
                     part = slots.force[i, pad, body, m] - ahead / (slots.regularisation[i, pad, body, m] * step)
                     part *= friction / wp.max(slots.friction[i, pad, body, m - 1], _LEAST)
                     total += part * part

@@ -141,8 +141,10 @@ def test_closing_tells_the_clients_frees_the_port_and_ends_all_threads():
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         probe.bind(("127.0.0.1", viewer.port))
-    left = [t for t in threading.enumerate() if t not in before and t.is_alive() and not t.name.startswith("ThreadPoolExecutor")]
-    assert left == []
+    started = [t for t in threading.enumerate() if t not in before and not t.name.startswith("ThreadPoolExecutor")]
+    for thread in started:
+        thread.join(5.0)
+    assert [t.name for t in started if t.is_alive()] == []
 
 
 def test_two_viewers_share_nothing(open_page):
