@@ -56,4 +56,5 @@ while world.data[0].time < 3.0:
     state = world.step(close)
 loads = {name: round(-float(state.wrench[name][0, 2]), 2) for name in sensors}
 carried = sum(-(state.world_from_pad[name][0, :3, :3] @ state.wrench[name][0, :3])[2] for name in sensors)
-print("block of %.3f N, of which pads carry %.3f N; they press with" % (9.81 * model.body("object").mass.item(), carried), loads)
+weight = 9.81 * model.body("object").mass.item()
+print("block of %.3f N, of which pads carry %.3f N; they press with" % (weight, carried), loads)
