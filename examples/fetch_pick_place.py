@@ -47,7 +47,7 @@ def pick(data: mujoco.MjData, time: float) -> None:
     data.ctrl[:] = 0.05 if time < 1.2 else data.qpos[fingers] - 40.0 / 30000.0  # of servos of 30 N/mm
 
 
-while world.data[0].time < 3.2:
+while world.data[0].time < 3.8:
     state = world.step(pick)
 frames = world.observe()
 lifted = state.world_from_body["object0"][0, 2, 3] - 0.425

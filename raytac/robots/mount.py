@@ -125,7 +125,7 @@ def mount(
         SpecError: the sensor's file is missing or wrong.
     """
     if not isinstance(spec, mujoco.MjSpec):
-        raise InputError("spec", value=type(spec).__name__, rule="must be a mujoco.MjSpec, from which a model is compiled later")
+        raise InputError("spec", value=type(spec).__name__, rule="must be a mujoco.MjSpec, such as mujoco.MjSpec.from_file(path)")
     loaded, carrier = sensor_spec(sensor), _carrier(spec, site, body)
     placement = standing_on(loaded) if pose is None else check_pose("pose", pose)
     if not isinstance(name, str) or not name:

@@ -85,7 +85,8 @@ def touched_bodies(
             raise InputError("touches", value=None, rule=rule, choices=_names(model, "BODY"))
         return tuple(_touched(model, model.body(b).name or f"body{b}", b, None) for b in free)
     if isinstance(touches, str) or not isinstance(touches, (Sequence, Mapping)):
-        raise InputError("touches", value=touches, rule="must be names of bodies or geoms, or a mapping of them to coefficients")
+        rule = "must be names of bodies or geoms, such as ['cube'], or a mapping of them to friction coefficients"
+        raise InputError("touches", value=touches, rule=rule)
     result: list[TouchedBody] = []
     for name in touches:
         body, geom = _find(model, name)

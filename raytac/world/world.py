@@ -123,6 +123,14 @@ class TactileWorld:
         own = {"sensors": sensors, "touches": touches, "control_timestep": control_timestep, "keyframe": keyframe}
         own["allow_overlap"] = allow_overlap or None
         is_own = isinstance(scene, (mujoco.MjSpec, mujoco.MjModel))
+        if not isinstance(scene, (str, Path, TaskScene, mujoco.MjSpec, mujoco.MjModel)):
+            rule = "must be a task scene, its name or path, a mujoco.MjSpec or a mujoco.MjModel"
+            raise InputError("scene", value=type(scene).__name__, rule=rule)
+        if isinstance(scene, (str, Path)) and Path(scene).suffix.lower() in (".xml", ".mjcf", ".urdf", ".mjb"):
+            rule = (
+                "is no task scene: a model of one's own is given as mujoco.MjSpec.from_file(path), with sensors by raytac.mount"
+            )
+            raise InputError("scene", value=scene, rule=rule)
         for given, value in own.items():
             if value is not None and not is_own:
                 raise InputError(given, value=value, rule="is for a MjSpec or MjModel: a task scene says this itself")

@@ -97,11 +97,14 @@ def own_world_model(
         own_contact: pads push by the gel's law, and MuJoCo must not collide the gels; else it must, and pads only look.
 
     Raises:
-        InputError: what those two refuse, a gel that collides or does not, an option with which pads cannot be stepped, a control step that
-            is no multiple, an unknown keyframe, or a gel that lies deeper than 0.1 mm in another geom that collides (by MuJoCo's
-            distance, of convex hulls).
+        InputError: no ``MjModel``, what those two refuse, a gel that collides or does not, an option with which pads cannot be stepped, a
+            control step that is no multiple, an unknown keyframe, or a gel that lies deeper than 0.1 mm in another geom that collides (by
+            MuJoCo's distance, of convex hulls).
         SpecError: a sensor's file is missing or wrong.
     """
+    if not isinstance(model, mujoco.MjModel):
+        rule = "must be a mujoco.MjModel, of which the states are: model = spec.compile()"
+        raise InputError("model", value=type(model).__name__, rule=rule)
     mounted = mounted_sensors(model, sensors)
     if own_contact:
         _check_options(model)
@@ -117,7 +120,7 @@ def own_world_model(
     if keyframe is not None:
         names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) for i in range(model.nkey)]
         if keyframe not in names:
-            rule = "must be a keyframe of the model"
+            rule = "must be a keyframe of the model" + ("" if model.nkey else ", which has none: add one by spec.add_key")
             raise InputError("keyframe", value=keyframe, rule=rule, choices=[name for name in names if name])
         key = names.index(keyframe)
         start, ctrl = model.key_qpos[key].copy(), model.key_ctrl[key].copy()
@@ -130,7 +133,7 @@ def _check_options(model: mujoco.MjModel) -> None:
     """Refuse options of MuJoCo under which a pad's contact would not act, or not as its law says."""
     option = model.opt
     if option.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        rule = "takes no contacts between mj_step1 and mj_step2"
+        rule = "takes no contacts between mj_step1 and mj_step2: set spec.option.integrator, or integrator= in the file"
         raise InputError("model.opt.integrator", value="RK4", rule=rule, choices=("Euler", "implicit", "implicitfast"))
     if option.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:
         rule = (
@@ -139,7 +142,7 @@ def _check_options(model: mujoco.MjModel) -> None:
         )
         raise InputError("model.opt.cone", value="pyramidal", rule=rule)
     if option.noslip_iterations:
-        rule = "must be 0: a gel sticks by its shear, which a noslip pass would undo"
+        rule = "must be 0 (spec.option.noslip_iterations = 0): a gel sticks by its shear, which a noslip pass would undo"
         raise InputError("model.opt.noslip_iterations", value=int(option.noslip_iterations), rule=rule)
     for bit in ("CONTACT", "CONSTRAINT"):
         if option.disableflags & getattr(mujoco.mjtDisableBit, f"mjDSBL_{bit}"):

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from raytac import InputError, TactileWorld, mount
+from raytac import InputError, PadStepper, TactileReader, TactileWorld, mount
 from raytac.se3 import pose
 from raytac.specs import load_sensor
 from raytac.world import Variation
@@ -220,8 +220,9 @@ SLEEP, NO_CONTACT = int(mujoco.mjtEnableBit.mjENBL_SLEEP), int(mujoco.mjtDisable
         (lambda: arm6(""), {}, "the model has no body with a free joint"),
         (arm6, {"sensors": ["middle"]}, r"sensors = 'middle': must be a sensor of the model.*left, right"),
         (arm6, {"control_timestep": 0.003}, r"control_timestep = 0.003: must be a whole multiple of the model's timestep of 0.002 s"),
-        (arm6, {"keyframe": "home"}, r"keyframe = 'home': must be a keyframe of the model"),
+        (arm6, {"keyframe": "home"}, r"keyframe = 'home': must be a keyframe of the model, which has none"),
         (arm6, {"allow_overlap": ["finger"]}, r"allow_overlap = 'finger': must be the name of a geom"),
+        (lambda: with_option(noslip_iterations=3), {}, r"noslip_iterations = 3: must be 0 \(spec.option.noslip_iterations = 0\)"),
         (arm6, {"physics": "ipc"}, r"physics = 'ipc': needs a task scene"),
         (lambda: with_option(cone=mujoco.mjtCone.mjCONE_PYRAMIDAL), {}, r"model.opt.cone = 'pyramidal'.*cone='elliptic'"),
         (lambda: with_option(integrator=mujoco.mjtIntegrator.mjINT_RK4), {}, r"model.opt.integrator = 'RK4'.*implicitfast"),
@@ -249,6 +250,24 @@ def test_a_model_without_sensors_and_one_that_mujoco_refuses() -> None:
     with_sensors(spec, collide=True)
     with pytest.raises(InputError, match=r"gel = 'left_gel': collides in MuJoCo.*mount the sensor with collide=False"):
         TactileWorld(spec)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("arm.xml", r"scene = 'arm.xml': is no task scene.*mujoco.MjSpec.from_file"),
+        (Path("arm.urdf"), r"scene = .*arm.urdf.*mujoco.MjSpec.from_file"),
+        (3, r"scene = 'int': must be a task scene, its name or path, a mujoco.MjSpec or a mujoco.MjModel"),
+    ],
+)
+def test_what_is_no_model_and_no_scene_is_refused_with_what_is(given: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        TactileWorld(given, touches=["cube"])
+    for reader in (TactileReader, PadStepper):
+        with pytest.raises(InputError, match=r"model = 'MjSpec': must be a mujoco.MjModel.*spec.compile\(\)"):
+            reader(arm6())  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match=r"spec = 'MjModel': must be a mujoco.MjSpec, such as mujoco.MjSpec.from_file\(path\)"):
+        mount(arm6().compile(), "gelsight_mini", site="left_tip")  # pyright: ignore[reportArgumentType]
 
 
 def test_a_gel_inside_the_robot_names_both_geoms_and_may_be_allowed() -> None:

@@ -19,7 +19,7 @@ def test_the_blocks_of_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     (tmp_path / "gripper.xml").write_text(ast.literal_eval(gripper), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "own-model.md").read_text(encoding="utf-8"), flags=re.S)
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     names: dict[str, Any] = {}
     forces = []
     for block in blocks:
@@ -29,6 +29,7 @@ def test_the_blocks_of_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPa
             forces.append(frame.force[:, 2])
             assert not frame.failed.any()
     assert [len(force) for force in forces] == [2, 1, 1]
+    np.testing.assert_allclose(names["still"].site("left_pad").xmat.reshape(3, 3)[:, 2], [0.0, -1.0, 0.0], atol=1e-12)
     assert (forces[0] < -1.0).all() and forces[2][0] < -1.0
     np.testing.assert_array_equal(forces[0][0], forces[0][1])
     assert names["reader"].read(names["data"])["left"].surface.indentation.max() > 5e-5
