@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.sparse import coo_array, diags_array
+from scipy.sparse.linalg import spsolve
 
 from tests.ipc.oracles.closed_forms import (
     BondedLayer,
@@ -100,3 +102,33 @@ def test_boussinesq_field_is_in_equilibrium_and_carries_its_load() -> None:
     stress = 2 * SOLID.shear * strain + lam * np.einsum("nii->n", strain)[:, None, None] * eye
     total = np.einsum("nij,nj,n->i", stress, n, np.repeat(w, 40) * 2 * np.pi / 40)
     assert total == pytest.approx([0, 0, 1.0], abs=1e-4)
+
+
+def torsion(ratio: float, n: int = 120) -> float:
+    """Torque per angle of a disc of radius 1 on a layer of thickness 1 / ``ratio``, G = 1, by finite volumes over radius and depth.
+
+    The angle ω obeys ∇·(r³ ∇ω) = 0, and the torque is 2π ∫∫ r³ |∇ω|². Cells are finest at the disc's edge.
+    """
+    grade = np.linspace(0.0, 1.0, n + 1) ** 2
+    r, z = np.concatenate([1.0 - grade[::-1], 1.0 + 7.0 * grade[1:]]), grade / ratio
+    border = np.concatenate([r[:1], 0.5 * (r[1:] + r[:-1]), r[-1:]])
+    height = 0.5 * (np.diff(z, prepend=0.0) + np.diff(z, append=z[-1]))
+    along = (0.25 * np.diff(r**4) / np.diff(r) ** 2)[:, None] * height
+    down = 0.25 * np.diff(border**4)[:, None] / np.diff(z)
+    node = np.arange(len(r) * len(z)).reshape(len(r), len(z))
+    one, two = np.r_[node[:-1].ravel(), node[:, :-1].ravel()], np.r_[node[1:].ravel(), node[:, 1:].ravel()]
+    weight, edge = np.concatenate([along.ravel(), down.ravel()]), np.arange(len(one))
+    gradient = coo_array((np.r_[-np.ones(len(one)), np.ones(len(one))], (np.r_[edge, edge], np.r_[one, two]))).tocsr()
+    stiffness = (gradient.T @ diags_array(weight) @ gradient).tocsr()
+    angle, free = np.zeros(node.shape), np.ones(node.shape, bool)
+    angle[r <= 1.0, 0] = 1.0
+    free[r <= 1.0, 0] = free[-1] = free[:, -1] = False
+    inner, turned = node[free], angle.ravel()
+    turned[inner] = np.asarray(spsolve(stiffness[inner][:, inner].tocsc(), -(stiffness @ turned)[inner]))
+    return 2.0 * np.pi * float(turned @ (stiffness @ turned))
+
+
+def test_the_twist_of_a_layer_is_that_of_its_volume() -> None:
+    for ratio in (0.5, 1.5):
+        assert BondedLayer(Elastic(3.0, 0.5), 1.0 / ratio).twist_stiffness(1.0) == pytest.approx(torsion(ratio), rel=0.02)
+    assert BondedLayer(Elastic(3.0, 0.5), 100.0).twist_stiffness(1.0) == pytest.approx(16.0 / 3.0, rel=1e-5)

@@ -262,8 +262,73 @@ def test_beyond_the_limit_it_slips_and_carries_no_more_than_the_cone() -> None:
     assert pads._shear.of(np.zeros(1, int), 0, np.zeros(1, int)).stuck[0] < 0.3
 
 
+def driven(timestep: float, friction: float, inertia: float = 1.0) -> tuple[TactileWorld, RigidPads]:
+    """A ball under 1 N on a flat gel, on a slide and a hinge that nothing slows down; it is at rest."""
+    spec = mujoco.MjSpec.from_string(f"""<mujoco><option timestep="{timestep}" cone="elliptic" integrator="implicitfast" gravity="0 0 0"/>
+        <worldbody><body name="base"><site name="tip"/></body><body name="ball" pos="0 0 0.005">
+        <joint name="z" type="slide" axis="0 0 1"/><joint name="x" type="slide" axis="1 0 0" armature="100"/>
+        <joint name="spin" type="hinge" axis="0 0 1" armature="{inertia}"/><geom type="sphere" size="0.005" mass="0.02"/></body></worldbody>
+        <actuator><motor joint="z"/></actuator></mujoco>""")
+    sensor = load_sensor("gelsight_mini")
+    sensor = replace(sensor, gelpad=replace(sensor.gelpad, dome_radius=(np.inf, np.inf)))
+    mount(spec, sensor, site="tip", name="pad", pose=np.eye(4))
+    world = TactileWorld(spec, sensors={"pad": sensor}, touches={"ball": friction}, outputs=("wrench",), device="cpu")
+    for _ in range(round(0.3 / timestep)):
+        world.step(press)
+    pads = world._pads
+    assert isinstance(pads, RigidPads)
+    return world, pads
+
+
+def press(data: mujoco.MjData, time: float) -> None:
+    data.ctrl[0] = -1.0
+
+
+@pytest.mark.parametrize("timestep", [1e-3, 2e-3, 5e-3, 10e-3])
+@pytest.mark.parametrize(("joint", "speed", "power"), [(1, 1e-3, 1.5), (1, 5e-3, 1.5), (2, 0.2, 2.5), (2, 0.8, 2.5)])
+def test_in_steady_slow_motion_force_and_stretch_are_those_of_theory(
+    timestep: float, joint: int, speed: float, power: float
+) -> None:
+    """Cattaneo and Mindlin's force at the place where the step ends, and the torque of the same springs, whatever the step."""
+    world, pads = driven(timestep, 0.3)
+    start, (stiffness, limit) = (
+        world.data[0].qpos[joint],
+        zip(pads._shear.stiffness[0, 0, 0], pads._shear.load[0, 0, 0], strict=True),
+    )
+    k, most = (stiffness, limit)[joint - 1]
+    full = power * most / k
+    world.data[0].qvel[joint] = speed
+    for _ in range(max(round(0.95 * full / speed / timestep), 1)):
+        state = world.step(press)
+        carried = state.wrench["pad"][0, 0 if joint == 1 else 5]
+        moved = world.data[0].qpos[joint] - start
+        theory = most * (1.0 - max(1.0 - moved / full, 0.0) ** power)
+        assert carried == pytest.approx(theory, abs=0.05 * most)
+        shear = pads._shear.mean[0, 0, 0, 0 if joint == 1 else 2] * k
+        assert shear == pytest.approx(carried, abs=0.05 * most)
+
+
+@pytest.mark.parametrize("timestep", [1e-3, 10e-3])
+@pytest.mark.parametrize("share", [0.5, 0.9, 1.2])
+def test_a_torque_that_comes_at_once_is_held_or_turns_a_light_ball(timestep: float, share: float) -> None:
+    """Its inertia is nothing to a step of 10 ms; beyond the limit the rest of the torque accelerates it."""
+    world, pads = driven(timestep, 0.6, inertia=0.0)
+    limit, inertia = pads._shear.load[0, 0, 0, 1], 0.4 * 0.02 * 5e-3**2
+    world.data[0].qfrc_applied[2] = share * limit
+    seen = []
+    for _ in range(round(0.3 / timestep)):
+        state = world.step(press)
+        seen.append((world.data[0].qvel[2], state.wrench["pad"][0, 5] / limit))
+    half, (speed, torque) = seen[len(seen) // 2][0], seen[-1]
+    if share < 1.0:
+        assert torque == pytest.approx(share, abs=0.05) and abs(speed) < 0.1 * np.abs(seen).max(axis=0)[0]
+    else:
+        gained = (share - 1.0) * limit / inertia * timestep * (len(seen) - 1 - len(seen) // 2)
+        assert torque == pytest.approx(1.0, abs=1e-3) and speed - half == pytest.approx(gained, rel=1e-2)
+
+
 def test_a_cube_that_is_pulled_shears_the_gel_as_mindlin_says() -> None:
-    """Both ends of the loaded steps are at rest, so the displacement is the elastic one."""
+    """Both ends of the loaded steps are at rest, and the load grows slowly, so the displacement is the elastic one."""
     share, mu = 0.7, 0.5
     world = cube_on(share, mu, 2e-3)
     pads = world._pads
@@ -274,8 +339,8 @@ def test_a_cube_that_is_pulled_shears_the_gel_as_mindlin_says() -> None:
     for _ in range(30):
         world.step()
     start = world.data[0].qpos[0]
-    world.model.opt.gravity[:] = gravity
-    for _ in range(60):
+    for k in range(90):
+        world.model.opt.gravity[0] = min(k / 30.0, 1.0) * gravity[0]
         world.step()
     stiffness, load = pads._shear.stiffness[0, 0, 0, 0], pads._shear.load[0, 0, 0, 0]
     force = float(np.hypot(*world.state().wrench["sensor"][0, :2]))

@@ -309,7 +309,7 @@ def _gels(gels: Sequence[GelpadSpec], bodies: Bodies, device: Any) -> Any:
     result.half = _array([np.multiply(0.5, gel.size) for gel in gels], wp.vec2d, device)
     result.modulus = _array([gel.youngs_modulus for gel in gels], wp.float64, device)
     result.shear = _array(np.stack([8.0 * shear / softer, np.pi * shear / thickness], axis=1), wp.vec2d, device)
-    result.twist = _array(np.stack([16.0 / 3.0 * shear, 0.5 * np.pi * shear / thickness], axis=1), wp.vec2d, device)
+    result.twist = _array(16.0 / 3.0 * shear, wp.float64, device)
     result.hysteresis = _array([gel.hysteresis for gel in gels], wp.float64, device)
     result.relaxation = _array([gel.relaxation_time for gel in gels], wp.float64, device)
     result.case_centre, result.case_half = (

@@ -7,7 +7,7 @@ end of the step. So every row is a given force and a viscous one at the end of t
 | row | f₀ | G |
 |---|---|---|
 | normal | F(δ) | c K (``normal_spring``) |
-| tangents | −k s, the shear's | k c, c >= Δt |
+| tangents | −k s, the shear's | k Δt; less of what slips |
 | spin | −k s, the shear's | as of the tangents on the lever of the cone |
 | rolling | −b | N m Δt, m the metacentric height |
 
@@ -34,8 +34,9 @@ from __future__ import annotations
 import warp as wp
 
 from raytac.physics.rigid.contact_rows import Rows
+from raytac.physics.rigid.load_law import TWIST_STIFFENING
 from raytac.physics.rigid.motion_kernels import Frames, closing_push, frame_of, place_of, push_at, turn_of
-from raytac.physics.rigid.shear_kernels import begin_shear, clear_shear, move_shear
+from raytac.physics.rigid.shear_kernels import begin_shear, clear_shear, move_shear, share_that_sticks
 from raytac.physics.rigid.spring_kernels import normal_spring
 from raytac.physics.rigid.step_kernels import law_of
 from raytac.physics.rigid.table_kernels import force_at, radius_at
@@ -61,6 +62,7 @@ _LEAST = wp.constant(wp.float64(1e-6))
 """Least coefficient of friction, which MuJoCo wants positive."""
 _LEVER = wp.constant(wp.float64(3.0 * 3.141592653589793 / 16.0))
 """Lever of the torque of spin over the contact's radius: Hertz's contact that slips as a whole."""
+_TWIST = wp.constant(wp.vec4d(*TWIST_STIFFENING))
 _ROLLING = wp.constant(wp.float64(3.0 / 16.0))
 """Bound of the friction of rolling, over radius and hysteresis."""
 _GIVE = wp.constant(wp.float64(8.0))
@@ -81,6 +83,19 @@ _HALF = wp.constant(wp.float64(0.5))
 def first_tangent(normal: wp.vec3d) -> wp.vec3d:
     """Unit tangent of a gel along the pad's x as nearly as can be; the second is that turned by 90° about the normal."""
     return wp.normalize(wp.vec3d(_1, _0, _0) - normal[0] * normal)
+
+
+@wp.func
+def lever_of(radius: wp.float64) -> wp.float64:
+    """Torque over force [m] at which a contact slips."""
+    return _LEVER * wp.max(radius, _LEAST)
+
+
+@wp.func
+def twist_stiffening(ratio: wp.float64) -> wp.float64:
+    """As ``load_law.twist_stiffening``."""
+    square = ratio * ratio
+    return _1 + _TWIST[0] * ratio * square / (_1 + square * (_TWIST[1] + _TWIST[2] / (_1 + _TWIST[3] * ratio)))
 
 
 @wp.func
@@ -138,40 +153,47 @@ def set_rows(
     factor, square = softening(vary, gels, touched, env, pad, body), radius * radius
     stiffness = wp.vec2d(
         wp.max((gels.shear[pad][0] * radius + gels.shear[pad][1] * square) * factor, wp.float64(1e-12)),
-        wp.max((gels.twist[pad][0] * radius + gels.twist[pad][1] * square) * square * factor, wp.float64(1e-12)),
+        wp.max(gels.twist[pad] * radius * square * twist_stiffening(radius / gels.thickness[pad]) * factor, wp.float64(1e-12)),
     )
-    friction, lever = friction_of(vary, touched, env, pad, body), _LEVER * wp.max(radius, _LEAST)
-    # As much at the end of a step as keeps both shear and spin stable, whatever its length.
-    time = wp.max(gels.relaxation[pad], step * wp.max(_1, stiffness[1] / (stiffness[0] * lever * lever)))
-    damping = stiffness[0] * time
-    pull = begin_shear(shear, env, pad, body, stiffness, centre)
+    friction, pull = friction_of(vary, touched, env, pad, body), begin_shear(shear, env, pad, body, stiffness, centre)
+
+    # As it moves at the start of the step, what slips by its end does not resist. From half of the stiffness on a step takes no less from
+    # the bodies than the gel stores, of shear and spin alike if the cone's lever is the ratio of both. Where all slips, the cone bounds
+    # shear and spin by the lever of friction, and there is more damping, so that both are stable should that slide end.
+    pose = motion.pose[i, pad, body]
+    first = first_tangent(normal)
+    second = wp.cross(normal, first)
+    spin = motion.spin[i, pad, body]
+    velocity = motion.velocity[i, pad, body] + wp.cross(spin, centre - place_of(pose))
+    slip = wp.vec3d(wp.dot(velocity, first), wp.dot(velocity, second), wp.dot(spin, normal))
+    normal_load = wp.max(spring.force + spring.damping * slots.speed[i, pad, body], _0)
+    limit, slip_lever = friction * normal_load, lever_of(radius)
+    sticks = share_that_sticks(shear, env, pad, body, step * slip, wp.vec2d(limit, limit * slip_lever))
+    ratio = stiffness[1] / stiffness[0]
+    lever, damping = wp.sqrt(ratio), step * stiffness[0] * wp.max(sticks, _HALF)
+    if sticks == _0:
+        lever, damping = slip_lever, step * stiffness[0] * wp.max(ratio / (slip_lever * slip_lever), _1)
 
     # A body that turns about its centre of mass moves the centre of pressure by the spread of the overlap per radian, less the height of
     # that centre over the gel: by nothing at all for a ball. Its principal tangents are those of the rows.
-    pose = motion.pose[i, pad, body]
     height = wp.dot(turn_of(pose) * touched.mass_centre[body] + place_of(pose) - centre, normal)
     angle = _HALF * wp.atan2(_2 * spread[1], spread[0] - spread[2])
     mean, half = _HALF * (spread[0] + spread[2]), wp.length(wp.vec2d(_HALF * (spread[0] - spread[2]), spread[1]))
     cos, sin = wp.cos(angle), wp.sin(angle)
-    first = first_tangent(normal)
-    second = wp.cross(normal, first)
     one = cos * first + sin * second
     axes = wp.matrix_from_rows(normal, one, wp.cross(normal, one))
 
     # What MuJoCo's convex cone adds to the normal force of a contact that slips, at the speed at the start of the step. Beyond the cone,
     # the force without it, (F, T), is projected to F + μ r (T − μF) / (1 + μ² r) with r the ratio of the dampings. If the free
     # acceleration, and its friction, make a different speed at the end, a slide begins or ends.
-    spin = motion.spin[i, pad, body]
-    velocity = motion.velocity[i, pad, body] + wp.cross(spin, centre - place_of(pose))
     lift = wp.float64(0.0)
     if spring.force > _0:
         back, frame = wp.transpose(rotation), frame_of(frames, touched, body)
         swing = back * (frames.swing[i, frame] - frames.swing[i, pad])
         gain = back * (push_at(frames, i, frame, at) - push_at(frames, i, pad, at))
-        normal_load = wp.max(spring.force + spring.damping * slots.speed[i, pad, body], _0)
-        limit, per_lift = friction * normal_load, friction * spring.damping / damping
+        per_lift = friction * spring.damping / damping
         elastic = wp.vec3d(pull[0], pull[1], pull[2] / lever)
-        slip = wp.vec3d(wp.dot(velocity, first), wp.dot(velocity, second), wp.dot(spin, normal) * lever)
+        slip = wp.vec3d(slip[0], slip[1], slip[2] * lever)
         gained = wp.vec3d(wp.dot(gain, first), wp.dot(gain, second), wp.dot(swing, normal) * lever)
         lift = per_lift * wp.max(wp.length(elastic + damping * slip) - limit, _0)
         free = wp.length(elastic + damping * (slip + step * gained)) - limit * (_1 + damping * step * compliance)
@@ -261,8 +283,8 @@ def read_rows(
     one, two = velocity[i, pad, body, 1] * step, velocity[i, pad, body, 2] * step
     displacement = wp.vec3d(turn[0] * one - turn[1] * two, turn[1] * one + turn[0] * two, velocity[i, pad, body, 3] * step)
     normal_load = force[i, pad, body, 0]
-    limit = wp.vec2d(normal_load * slots.friction[i, pad, body, 0], normal_load * slots.friction[i, pad, body, 2])
-    move_shear(shear, env, pad, body, displacement, limit, centre, slots.radius[i, pad, body])
+    radius, limit = slots.radius[i, pad, body], normal_load * slots.friction[i, pad, body, 0]
+    move_shear(shear, env, pad, body, displacement, wp.vec2d(limit, limit * lever_of(radius)), centre, radius)
     bend = slots.bend[i, pad, body]
     one, two = velocity[i, pad, body, 4] * step * bend[0], velocity[i, pad, body, 5] * step * bend[1]
     angle = wp.vec2d(turn[0] * one - turn[1] * two, turn[1] * one + turn[0] * two)

@@ -64,6 +64,8 @@ def begin_shear(shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, stif
     k = wp.int32(0)
     while k < _RINGS and wp.float64(k) < size:
         low = wp.float64(k)
+        if low + _1 <= size:  # not the outermost: where the load vibrates, its halves would join and slip in every cycle
+            halve_whole(shear, env, pad, body, k)
         edge, high = low + shear.inner[env, pad, body, k], wp.min(low + _1, size)
         total += wp.cw_mul(weight(low, edge), shear.stretch[env, pad, body, 2 * k])
         total += wp.cw_mul(weight(edge, high), shear.stretch[env, pad, body, 2 * k + 1])
@@ -178,6 +180,51 @@ def halve_whole(shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, k: w
 
 
 @wp.func
+def limits_of(stiffness: wp.vec2d, limit: wp.vec2d) -> wp.vec2d:
+    """Stretch [m] and rotation [rad] at which the centre slips: what all rings carry at their limits adds up to ``limit``."""
+    return wp.vec2d(
+        wp.float64(1.5) * limit[0] / wp.max(stiffness[0], _TINY), wp.float64(2.5) * limit[1] / wp.max(stiffness[1], _TINY)
+    )
+
+
+@wp.func
+def share_that_sticks(
+    shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, displacement: wp.vec3d, limit: wp.vec2d
+) -> wp.float64:
+    """Stiffness against a displacement over that without slip; 0 where all of the contact would slip.
+
+    The displacement is one that may come in the step, ``limit`` as in ``move_shear``.
+    """
+    stiffness = shear.stiffness[env, pad, body]
+    centre = limits_of(stiffness, limit)
+    size = stiffness[0] / shear.width[env, pad, body]
+    total, slips = wp.vec3d(), wp.bool(True)
+    k = wp.int32(0)
+    while k < 2 * _RINGS and wp.float64(k // 2) < size:
+        ring = wp.float64(k // 2)
+        edge, high = ring + shear.inner[env, pad, body, k // 2], wp.min(ring + _1, size)
+        low = edge
+        if k % 2 == 0:
+            low, high = ring, edge
+        if high > low:
+            before = shear.stretch[env, pad, body, k]
+            ahead = before + displacement
+            after = slipped(ahead, centre[0], centre[1], low / size, high / size)
+            if after == ahead:
+                slips = wp.bool(False)
+            total += wp.cw_mul(weight(low, high), after - before)
+        k += 1
+    if slips:
+        return _0
+    scale = wp.vec3d(stiffness[0], stiffness[0], stiffness[1])
+    full = wp.dot(wp.cw_mul(scale, displacement), displacement)
+    taken = wp.dot(wp.cw_mul(scale, displacement), wp.cw_div(total, weight(_0, size)))
+    if full > _0:
+        return wp.clamp(taken / full, _TINY, _1)
+    return _1
+
+
+@wp.func
 def move_shear(
     shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, displacement: wp.vec3d, limit: wp.vec2d, centre: wp.vec3d,
     radius: wp.float64,
@@ -188,17 +235,14 @@ def move_shear(
     ``radius`` [m]. Gel that leaves the contact as it rolls on takes its stretch with it: over the contact's diameter.
     """
     stiffness, reach = shear.stiffness[env, pad, body], wp.max(radius, wp.float64(0.5e-9))
-    # Of the centre: what all rings carry at their limits adds up to ``limit``.
-    along = wp.float64(1.5) * limit[0] / wp.max(stiffness[0], _TINY)
-    about = wp.float64(2.5) * limit[1] / wp.max(stiffness[1], _TINY)
+    largest = limits_of(stiffness, limit)
+    along, about = largest[0], largest[1]
     kept = wp.exp(-rolled(shear, env, pad, body, centre, reach) / (_2 * reach))
     size = stiffness[0] / shear.width[env, pad, body]
     total = wp.vec3d()
     k = wp.int32(0)
     while k < _RINGS and wp.float64(k) < size:
         low = wp.float64(k)
-        if low + _1 <= size:  # not the outermost: where the load vibrates, its halves would join and slip in every cycle
-            halve_whole(shear, env, pad, body, k)
         edge, high = low + shear.inner[env, pad, body, k], wp.min(low + _1, size)
         if edge > low:
             stretch = kept * slipped(shear.stretch[env, pad, body, 2 * k] + displacement, along, about, low / size, edge / size)

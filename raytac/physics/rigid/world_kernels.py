@@ -30,8 +30,8 @@ class Gels:
     """Young's [Pa]."""
     shear: wp.array(dtype=wp.vec2d)
     """Shear stiffness [N/m] over the contact's radius, and over its square."""
-    twist: wp.array(dtype=wp.vec2d)
-    """Twist stiffness [N m/rad] over the third power of the radius, and over the fourth."""
+    twist: wp.array(dtype=wp.float64)
+    """Twist stiffness [N m/rad] of a half-space over the third power of the radius."""
     hysteresis: wp.array(dtype=wp.float64)
     relaxation: wp.array(dtype=wp.float64)
     """Time [s]."""

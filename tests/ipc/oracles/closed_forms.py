@@ -119,3 +119,20 @@ class BondedLayer:
                 return force
             contact *= np.sqrt(depth / reached)  # depth grows about as a², on a half-space and on a thin layer
         raise ArithmeticError(f"no contact radius found for a depth of {depth} m")
+
+    def twist_stiffness(self, radius: float) -> float:
+        """Torque per angle [N m/rad] of a disc that sticks to the layer and turns about its axis.
+
+        The shear stress τ has the transform ∫ r τ J₁(kr) dr = ∫₀ᵃ φ(s) sin(ks) ds, which moves the surface by tanh(kt)/(G k). So
+
+            φ(s) + (2/π) ∫₀ᵃ φ(s') K(s, s') ds' = (4/π) G θ s,    K = ∫₀^∞ (tanh(kt) − 1) sin(ks) sin(ks') dk,
+
+        and the torque is 4π ∫₀ᵃ φ s ds: 16/3 G a³ θ on a half-space (Reissner and Sagoci 1944).
+        """
+        s, w = self._nodes(radius)
+        sines = np.sin(np.outer(s / self.thickness, self._wave))
+        u, weights = np.polynomial.legendre.leggauss(10)
+        spectrum = np.tile(weights / 8, len(self._wave) // len(u)) * (np.tanh(self._wave) - 1)
+        kernel = (sines * spectrum) @ sines.T / self.thickness
+        phi = np.linalg.solve(np.eye(len(s)) + 2 / np.pi * kernel * w, 4 / np.pi * self.solid.shear * s)
+        return float(4 * np.pi * (w * s) @ phi)

@@ -97,17 +97,20 @@ def gel_rows(
     radius, load = law.radius(deepest), law.force(deepest)[0]
     stiffness = np.ones((len(contacts), 2))
     hysteresis = np.zeros(len(contacts))
-    tau = np.zeros(len(contacts))
     for k, gel in enumerate(gels):
         some = contacts.pad == k
         size = radius[some]
         stiffness[some] = np.stack([shear_stiffness(size, gel), twist_stiffness(size, gel)], axis=1)
-        hysteresis[some], tau[some] = gel.hysteresis, gel.relaxation_time
+        hysteresis[some] = gel.hysteresis
     stiffness = np.maximum(stiffness * softer[:, None], 1e-12)
-    lever = 3.0 * np.pi / 16.0 * np.maximum(radius, 1e-6)
-    # As much at the end of a step as keeps both shear and spin stable, whatever its length.
-    time = np.maximum(tau, step * np.maximum(1.0, stiffness[:, 1] / (stiffness[:, 0] * lever**2)))
-    damping = stiffness[:, 0] * time
+    pull = shear.begin(at, stiffness, contacts.centre)
+    moving = _Moving.of(contacts, spring, motion, row)
+    slip_lever, limit = slip_levers(radius), friction * moving.load
+    slip = np.append(moving.slip(), moving.turning()[:, None], axis=1) * step[:, None]
+    sticks = shear.share_that_sticks(at, slip, np.stack([limit, limit * slip_lever], axis=1))
+    ratio = stiffness[:, 1] / stiffness[:, 0]
+    lever = np.where(sticks > 0.0, np.sqrt(ratio), slip_lever)
+    damping = step * stiffness[:, 0] * np.where(sticks > 0.0, np.maximum(sticks, 0.5), np.maximum(ratio / slip_lever**2, 1.0))
     spread, height, turn = _tilt(contacts, motion, row, mass_centre)
     metacentric = np.maximum(spread - height[:, None], 0.0)
     per_square = (load * step / damping)[:, None]
@@ -118,9 +121,8 @@ def gel_rows(
     plastic = 3.0 / 16.0 * hysteresis[:, None]
     whole = np.maximum(tilt, friction[:, None] * np.sqrt(per_square * (metacentric + 8.0 * plastic * arm)))
     whole = np.maximum(whole, 4.0 * plastic * radius[:, None])
-    pull = shear.begin(at, stiffness, contacts.centre)
     force = np.zeros((len(contacts), ROWS))
-    lift, slides = _lift(contacts, spring, motion, row, step, friction, lever, damping, pull, gain, compliance)
+    lift, slides = _lift(moving, spring, step, friction, lever, damping, pull, gain, compliance)
     force[:, 0] = spring.force - lift
     force[:, 1:3] = -(pull[:, None, :2] @ turn)[:, 0]
     force[:, 3] = -pull[:, 2]
@@ -163,11 +165,42 @@ def row_axes(normal: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return np.stack([normal, one, cross(normal, one)], axis=1)
 
 
+@dataclass(frozen=True)
+class _Moving:
+    """Motion of bodies over gels where they touch, pad frame, and the load [N], at the start of the step."""
+
+    velocity: np.ndarray
+    spin: np.ndarray
+    normal: np.ndarray
+    load: np.ndarray
+
+    @staticmethod
+    def of(contacts: PadContacts, spring: NormalSpring, motion: PadMotion, row: np.ndarray) -> _Moving:
+        at = row, contacts.pad, contacts.body
+        velocity = motion.velocity[at] + cross(motion.spin[at], contacts.centre - motion.pad_from_body[at][:, :3, 3])
+        load = np.maximum(spring.force + spring.damping * -np.vecdot(velocity, contacts.normal), 0.0)
+        return _Moving(velocity, motion.spin[at], contacts.normal, load)
+
+    def after(self, gain: np.ndarray) -> _Moving:
+        return _Moving(self.velocity + gain[:, :3], self.spin + gain[:, 3:], self.normal, self.load)
+
+    def slip(self) -> np.ndarray:
+        """Speeds (n, 2) along both tangents."""
+        return np.stack([np.vecdot(self.velocity, tangent) for tangent in tangents(self.normal)], axis=1)
+
+    def turning(self) -> np.ndarray:
+        """Speeds (n,) about the normal."""
+        return np.vecdot(self.spin, self.normal)
+
+
+def slip_levers(radius: np.ndarray) -> np.ndarray:
+    """Torque over force [m] at which contacts slip."""
+    return 3.0 * np.pi / 16.0 * np.maximum(radius, 1e-6)
+
+
 def _lift(
-    contacts: PadContacts,
+    moving: _Moving,
     spring: NormalSpring,
-    motion: PadMotion,
-    row: np.ndarray,
     step: np.ndarray,
     friction: np.ndarray,
     lever: np.ndarray,
@@ -181,21 +214,15 @@ def _lift(
 
     Beyond the cone, the force without it, (F, T), is projected to F + μ r (T − μF) / (1 + μ² r) with r the ratio of the dampings.
     """
-    at = row, contacts.pad, contacts.body
-    arm = contacts.centre - motion.pad_from_body[at][:, :3, 3]
-    velocity = motion.velocity[at] + cross(motion.spin[at], arm)
-    one, two = tangents(contacts.normal)
-    load = np.maximum(spring.force + spring.damping * -np.vecdot(velocity, contacts.normal), 0.0)
 
-    def excess(velocity: np.ndarray, spin: np.ndarray, share: np.ndarray) -> np.ndarray:
-        slip = np.stack([np.vecdot(velocity, one), np.vecdot(velocity, two)], axis=1)
-        tangential = pull[:, :2] + damping[:, None] * slip
-        torque = pull[:, 2] / lever + damping * np.vecdot(spin, contacts.normal) * lever
-        over = np.sqrt(np.vecdot(tangential, tangential) + torque**2) - share * friction * load
+    def excess(moving: _Moving, share: np.ndarray) -> np.ndarray:
+        tangential = pull[:, :2] + damping[:, None] * moving.slip()
+        torque = pull[:, 2] / lever + damping * moving.turning() * lever
+        over = np.sqrt(np.vecdot(tangential, tangential) + torque**2) - share * friction * moving.load
         return np.where(spring.force > 0.0, friction * spring.damping / damping * np.maximum(over, 0.0), 0.0)
 
-    ends = velocity + step[:, None] * gain[:, :3], motion.spin[at] + step[:, None] * gain[:, 3:]
-    lift, free = excess(velocity, motion.spin[at], np.ones_like(load)), excess(*ends, 1.0 + damping * step * compliance)
+    lift = excess(moving, np.ones_like(step))
+    free = excess(moving.after(step[:, None] * gain), 1.0 + damping * step * compliance)
     return lift, np.abs(free - lift) > 0.01 * np.maximum(spring.force, 0.0)
 
 

@@ -61,9 +61,27 @@ class ShearOracle:
                         parts = parts.doubled()
                     parts.grow(after, stiffness[k, 1] / after)
                 self.stretch[row], self.inner[row], self.width[row] = parts.stretch.reshape(-1, 3), parts.inner, parts.width
-            mean[k] = _Parts.of(self, row, after).mean()
+            parts = _Parts.of(self, row, after)
+            parts.halve_whole()
+            self.stretch[row], self.inner[row], mean[k] = parts.stretch.reshape(-1, 3), parts.inner, parts.mean()
         self.stiffness[rows] = stiffness
         return stiffness[:, [0, 0, 1]] * mean
+
+    def share_that_sticks(self, rows: tuple[np.ndarray, ...], displacement: np.ndarray, limit: np.ndarray) -> np.ndarray:
+        """Stiffness (n,) against displacements (n, 3) over that without slip; 0 where all of a contact would slip."""
+        result = np.zeros(len(displacement))
+        for k, row in enumerate(zip(*rows, strict=True)):
+            stiffness = self.stiffness[row]
+            parts = _Parts.of(self, row, stiffness[0])
+            before, mean = parts.stretch.copy(), parts.mean()
+            parts.slip(displacement[k], limit[k] / np.maximum(stiffness, 1e-30), 1.0)
+            low, high = parts.edges()
+            slips = (parts.stretch != before + displacement[k]).any(axis=2) | (high <= low)
+            work = stiffness[[0, 0, 1]] * displacement[k]
+            if not slips.all():
+                full = work @ displacement[k]
+                result[k] = np.clip(work @ (parts.mean() - mean) / full, 1e-30, 1.0) if full > 0.0 else 1.0
+        return result
 
     def move(
         self, rows: tuple[np.ndarray, ...], displacement: np.ndarray, limit: np.ndarray, centre: np.ndarray, radius: np.ndarray
@@ -77,7 +95,6 @@ class ShearOracle:
         kept = np.exp(-self._rolled(rows, centre, radius) / (2.0 * radius))
         for k, row in enumerate(zip(*rows, strict=True)):
             parts = _Parts.of(self, row, self.stiffness[row][0])
-            parts.halve_whole()
             parts.slip(displacement[k], limit[k] / np.maximum(self.stiffness[row], 1e-30), kept[k])
             self.stretch[row], self.inner[row], self.mean[row] = parts.stretch.reshape(-1, 3), parts.inner, parts.mean()
         self.load[rows], self.centre[rows] = limit, centre

@@ -18,7 +18,7 @@ from raytac.specs import load_sensor
 from raytac.world.forbidden_overlap import BondedFaces
 from raytac.world.gel_pairs import GelPairs
 from tests.physics.rigid.oracle_motion import PadMotion, cross, motion_of, turned
-from tests.physics.rigid.oracle_rows import gel_rows, rolled_on, row_axes
+from tests.physics.rigid.oracle_rows import gel_rows, rolled_on, row_axes, slip_levers
 from tests.physics.rigid.oracle_shear import ShearOracle
 from tests.physics.rigid.oracle_spring import contact_rate, normal_spring
 from tests.physics.rigid.oracle_steps import StepChoice
@@ -270,7 +270,8 @@ class Step:
         moved = np.empty((len(held), 3))
         moved[:, :2] = (turn @ velocity[:, 1:3, None])[..., 0] * rows.step[:, None]
         moved[:, 2] = velocity[:, 3] * rows.step
-        self.shear.move(self.slot, moved, force[:, :1] * rows.friction[:, [0, 2]], held.centre, self.radius)
+        limit = force[:, 0] * rows.friction[:, 0]
+        self.shear.move(self.slot, moved, np.stack([limit, limit * slip_levers(self.radius)], axis=1), held.centre, self.radius)
         self.rolling = np.zeros(self.state.rolling.shape)
         angle = (turn @ (rows.step[:, None] * rows.bend * velocity[:, 4:])[..., None])[..., 0]
         self.rolling[self.slot] = rolled_on(self.state.rolling[self.slot], angle)
