@@ -120,8 +120,8 @@ class GelpadSpec:
     """α, share of the energy that the gel loses in a cycle of rolling; used by the rigid pad in worlds alone. 0.1 is a guess: silicone
     elastomers lose some per cent to some tens of per cent."""
     relaxation_time: float = 0.002
-    """τ [s] of the gel's internal damping (Kelvin and Voigt): it carries E (ε + τ dε/dt); used by the rigid pad in worlds alone. Not
-    measured: with 2 ms the loss tangent is 0.13 at 10 Hz."""
+    """τ [s] of the gel's internal damping along a contact's normal (Kelvin and Voigt): it carries E (ε + τ dε/dt); used by the rigid pad in
+    worlds alone. Not measured: with 2 ms the loss tangent is 0.13 at 10 Hz."""
 
     def __post_init__(self) -> None:
         check_fields(vars(self), SENSOR_SCHEMA["gelpad"], "gelpad")

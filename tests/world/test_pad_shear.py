@@ -41,7 +41,7 @@ def mindlin(displacement: np.ndarray) -> np.ndarray:
     return LIMIT * (1.0 - np.clip(1.0 - displacement / FULL, 0.0, 1.0) ** 1.5)
 
 
-@pytest.mark.parametrize("share", [0.15, 0.2, 0.3, 0.6])
+@pytest.mark.parametrize("share", [0.07, 0.1, 0.15, 0.3, 0.6])
 def test_small_oscillations_take_energy_as_masing_says(share: float) -> None:
     top = share * FULL
     up, down = np.linspace(0.0, top, 30), np.linspace(top, -top, 120)[1:]
@@ -49,7 +49,7 @@ def test_small_oscillations_take_energy_as_masing_says(share: float) -> None:
     area = abs(np.trapezoid(forces(path)[len(up) - 1 :], path[len(up) - 1 :]))
     down = np.append(top, down)
     back = mindlin(np.array([top])) - 2.0 * mindlin(0.5 * (top - down))
-    assert area == pytest.approx(abs(2.0 * np.trapezoid(back, down)), rel=0.2)
+    assert area == pytest.approx(abs(2.0 * np.trapezoid(back, down)), rel=0.12)
 
 
 @pytest.mark.parametrize("steps", [7, 40, 300])

@@ -29,9 +29,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MOST_RINGS = 24
+MOST_RINGS = 48
 """Rings of a contact at most, all of one shear stiffness but the outermost."""
-LEAST_RINGS = 9
+LEAST_RINGS = 18
 """And at least: three quarters of what the most are when two become one."""
 
 
