@@ -182,14 +182,15 @@ def agreement(rows: list[Row]) -> list[Row]:
     """Rows that compare every case with steps of 2 ms to the same one with 1 ms, by the curve ``result``."""
     known, result = {row["case"]: row for row in rows}, []
     for name, row in known.items():
-        other = known.get(name.replace("_2ms", "_1ms"))
-        if not name.endswith("_2ms") or other is None or "result" not in row["curves"] or "result" not in other["curves"]:
+        of = name.removesuffix("_2ms")  # a drop's speed may read _2ms-1
+        other = known.get(f"{of}_1ms")
+        if of == name or other is None or "result" not in row["curves"] or "result" not in other["curves"]:
             continue
         outcome = Outcome()
         for label, a, b in zip(row["curves"]["result_of"], row["curves"]["result"], other["curves"]["result"], strict=True):
             whole = 1.0 if label.startswith("share") else abs(b)
             outcome.add(f"steps of 2 and 1 ms: {label}", abs(a - b) / whole if whole else np.inf, 0.02)
-        result.append(measured(name.replace("_2ms", "_steps"), partial(_same, outcome)))
+        result.append(measured(f"{of}_steps", partial(_same, outcome)))
     return result
 
 

@@ -92,6 +92,19 @@ def test_drops_begin_at_one_height_whatever_the_step() -> None:
     assert begun[0] == begun[1]
 
 
+def test_steps_are_compared_within_one_speed() -> None:
+    """The speed of a drop reads like a step: 2ms-1."""
+
+    def row(name: str, force: float) -> hard.Row:
+        return {"case": name, "curves": {"result_of": ["greatest force"], "result": [force]}}
+
+    speeds = (1.0, 2.0, 5.0)
+    rows = [row(f"drop_5g_{v:g}ms-1_{dt}ms", 10.0 * v + (0.1 if dt == 2 else 0.0)) for v in speeds for dt in (1, 2, 10)]
+    compared = hard.agreement(rows)
+    assert [one["case"] for one in compared] == [f"drop_5g_{v:g}ms-1_steps" for v in speeds]
+    assert [one["checks"][0]["value"] for one in compared] == pytest.approx([0.01 / v for v in speeds])
+
+
 def test_full_runs_have_every_combination() -> None:
     quick, full = hard.all_cases(hard.Args()), hard.all_cases(hard.Args(full=True))
     drops = [name for name in full if name.startswith("drop")]
