@@ -32,8 +32,8 @@ def test_a_run_reports_every_check_and_goes_on_where_it_stopped(tmp_path: Path, 
     text = (tmp_path / "table.txt").read_text()
     assert "steps of 2 and 1 ms: greatest depth" in text and (tmp_path / "rigid_hard.png").stat().st_size > 10_000
     ran.clear()
-    hard.main(hard.Args(**options, cases="drop_5g_1ms-1_1ms,grasps_sphere"))
-    assert ran == ["grasps_sphere"]
+    hard.main(hard.Args(**options, cases="drop_5g_1ms-1_1ms,grasps_sphere_0"))
+    assert ran == ["grasps_sphere_0"]
     with pytest.raises(InputError, match="other settings"):
         hard.main(hard.Args(**{**options, "seconds": 0.03}, cases="pin*"))
 
@@ -110,5 +110,6 @@ def test_full_runs_have_every_combination() -> None:
     drops = [name for name in full if name.startswith("drop")]
     assert len(drops) == 3 * 6 * 5 and set(quick) <= set(full)
     assert {f"lift_mu{mu:g}_2ms" for mu in (0.1, 0.3, 1.0, 1.5)} <= set(full)
-    counts = [case.args[1] for name, case in full.items() if name.startswith("grasps")]  # type: ignore[attr-defined]
-    assert sum(counts) == 10_000 and np.ptp(counts) <= 1
+    counts = {name: case.args[1] for name, case in full.items() if name.startswith("grasps")}  # type: ignore[attr-defined]
+    shares = [sum(n for name, n in counts.items() if name.startswith(f"grasps_{thing}_")) for thing in hard.OBJECTS]
+    assert sum(counts.values()) == sum(shares) == 10_000 and np.ptp(shares) <= 1 and max(counts.values()) <= 128
