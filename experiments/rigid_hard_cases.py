@@ -532,7 +532,8 @@ def reversal(dt: float) -> Outcome:
 def grasps(name: str, count: int, seed: int, piece: int) -> Outcome:
     """Random grasps of one shipped object: any attitude, off centre, with 0.3 to 10 N, then a load of a fifth of that.
 
-    ``piece`` numbers the cases of one object. One that is thrown out of the pads is no fault. Objects wider than the gripper opens keep the attitude of their file.
+    ``piece`` numbers the cases of one object. One that is thrown out of the pads is no fault. Objects wider than the gripper opens keep the
+    attitude of their file.
     """
     rng, outcome = np.random.default_rng((seed, OBJECTS.index(name), piece)), Outcome()
     thing = load_press(name).object
