@@ -11,6 +11,7 @@ import warp as wp
 
 from raytac.physics.rigid.gel_contact import GelContact, Launch
 from raytac.physics.rigid.world_kernels import ROWS
+from raytac.world.implicit_damping import ImplicitDamping
 from raytac.world.mujoco_kernels import (
     Memory,
     correct_lifts,
@@ -49,6 +50,7 @@ class MujocoRows:
         num_envs, pads = contact.wrenches.shape
         state, one = checked_layouts()
         self._contact, self._blank = contact, _blank()
+        self._damping = ImplicitDamping(model)
         self._address, self._sparse = np.zeros(num_envs, np.uint64), np.zeros(1, np.int32)
         self._datas: list[mujoco.MjData] = []
         self._models: list[mujoco.MjModel] = []
@@ -101,11 +103,12 @@ class MujocoRows:
         """Frames of pads and bodies of the environments of this step."""
         self._read(count)
 
-    def put(self, envs: Sequence[int]) -> None:
+    def put(self, envs: Sequence[int], *, own_step: bool) -> None:
         """Put the contacts that ``GelContact.begin`` found after MuJoCo's own.
 
-        An environment whose memory for contacts is full is lost.
+        An environment whose memory for contacts is full is lost. ``own_step``: ``second_half`` follows, not somebody else's ``mj_step2``.
         """
+        self._damping.clear()
         count, blank, views = len(envs), self._blank, self._contact.views
         assert views is not None
         lost, rows = views.lost[:count].tolist(), []
@@ -118,6 +121,8 @@ class MujocoRows:
                     views.lost[i] = 1
                     break
             else:
+                if own_step and self._damping.matters:
+                    self._damping.add(envs[i], model, data, float(views.length[i]))
                 rows.append((model, data))
         if rows:
             self._write(count)
@@ -147,7 +152,8 @@ class MujocoRows:
         models, datas, options = self._models, self._datas, self._options
         for b, length in zip(envs, lengths, strict=True):
             options[b].timestep = length
-            mujoco.mj_step2(models[b], datas[b])
+            if not self._damping.step(b, models[b], datas[b]):
+                mujoco.mj_step2(models[b], datas[b])
             options[b].timestep = timestep
 
     def read_forces(self, count: int) -> None:

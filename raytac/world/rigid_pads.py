@@ -195,7 +195,7 @@ class RigidPads:
         self._read_frames(envs, done)
         self._contact.begin(len(envs), whole=whole)
         self._mark_pierced(envs)
-        self._mujoco.put(envs.tolist())
+        self._mujoco.put(envs.tolist(), own_step=not whole)
 
     def _mark_pierced(self, envs: np.ndarray) -> None:
         """Mark environments as lost in which a body is beyond a bonded face, or was on its path since the last step."""
