@@ -236,10 +236,11 @@ class TaskBatch:
         self.time_s["physics"] += done - start
         failed = state.failed
         now, body, wrench = self.control.state(), state.world_from_body[self.task.body], state.wrench
-        tool, joint_speed, self._opening = now.tool, now.speed, now.opening
+        tool, joint_speed, opening, self._opening = now.tool, now.speed, self._opening, now.opening
         if failed.any():
-            # An environment that failed keeps its last poses.
+            # An environment that failed keeps its last poses and opening.
             tool[failed], body[failed], joint_speed[failed] = self._tool[failed], self._body[failed], 0.0
+            self._opening[failed] = opening[failed]
             wrench = {name: np.nan_to_num(values) for name, values in wrench.items()}
         dt = self.control_timestep
         moved, turned = self._errors((body, self._body), (tool, self.start_tool))

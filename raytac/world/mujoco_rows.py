@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -10,6 +11,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from raytac.errors import InputError
 from raytac.physics.rigid.gel_contact import GelContact
 from raytac.physics.rigid.recorded import Recorded
 from raytac.physics.rigid.world_kernels import ROWS
@@ -100,10 +102,23 @@ class MujocoRows:
             self._options = [model.opt for model in models]
         self._sparse[0] = mujoco.mj_isSparse(models[0])
 
+    def check_options(self, timestep: float) -> None:
+        """Raise ``InputError`` where a model has another timestep than ``timestep`` [s], or a cone in which pads cannot act."""
+        options = self._options[0]
+        if options.timestep != timestep:
+            rule = f"must stay {timestep!r} s, with which the pads were made"
+            raise InputError("model.opt.timestep", value=options.timestep, rule=rule)
+        if options.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:
+            raise InputError("model.opt.cone", value="pyramidal", rule="must stay elliptic, since a gel sticks by its shear")
+
     def first_half(self, envs: Sequence[int]) -> None:
         """``mj_step1``."""
         for b in envs:
             mujoco.mj_step1(self._models[b], self._datas[b])
+
+    def counts(self, envs: Sequence[int]) -> list[tuple[int, int]]:
+        """Contacts and rows that MuJoCo has, of each environment."""
+        return [(self._datas[b].ncon, self._datas[b].nefc) for b in envs]
 
     def accelerate(self, envs: Sequence[int]) -> None:
         """Accelerations that everything but contacts and other constraints would give, by the controls; ``mj_step2`` finds the same."""
@@ -128,7 +143,8 @@ class MujocoRows:
     def put(self, envs: Sequence[int], *, own_step: bool) -> None:
         """Put the contacts that ``GelContact.begin`` found after MuJoCo's own.
 
-        An environment whose memory for contacts is full is lost. ``own_step``: ``second_half`` follows, not somebody else's ``mj_step2``.
+        An environment whose memory for contacts is full is lost, with a ``RuntimeWarning``. ``own_step``: ``second_half`` follows, not
+        somebody else's ``mj_step2``.
         """
         self._damping.clear()
         count, blank, views = len(envs), self._blank, self._views
@@ -139,19 +155,26 @@ class MujocoRows:
             model, data = self._models[envs[i]], self._datas[envs[i]]
             for _ in range(number):
                 if mujoco.mj_addContact(model, data, blank) != 0:
-                    views.lost[i] = 1
+                    self._lose(envs[i], i)
                     break
             else:
                 if own_step and self._damping.matters:
                     self._damping.add(envs[i], model, data, float(views.length[i]))
-                rows.append((model, data))
+                rows.append((i, model, data))
         if rows:
             self._write()
-            for model, data in rows:
+            for i, model, data in rows:
                 # The contacts come after MuJoCo's own collision, so what it has built on those is built again.
-                mujoco.mj_makeConstraint(model, data)
+                try:
+                    mujoco.mj_makeConstraint(model, data)
+                except mujoco.FatalError:
+                    self._lose(envs[i], i)
+                if not data.nefc:
+                    self._lose(envs[i], i)
             self._regularise()
-            for model, data in rows:
+            for i, model, data in rows:
+                if views.lost[i]:
+                    continue
                 mujoco.mj_island(model, data)
                 mujoco.mj_projectConstraint(model, data)
                 mujoco.mj_referenceConstraint(model, data)
@@ -168,14 +191,28 @@ class MujocoRows:
                 mujoco.mj_fwdConstraint(self._models[envs[i]], self._datas[envs[i]])
             self._correct()
 
-    def second_half(self, envs: Sequence[int], lengths: Sequence[float], timestep: float) -> None:
-        """``mj_step2`` of the length [s] of each environment's step; afterwards the models have ``timestep`` again."""
-        models, datas, options = self._models, self._datas, self._options
-        for b, length in zip(envs, lengths, strict=True):
-            options[b].timestep = length
-            if not self._damping.step(b, models[b], datas[b]):
-                mujoco.mj_step2(models[b], datas[b])
-            options[b].timestep = timestep
+    def second_half(self, envs: Sequence[int], timestep: float) -> None:
+        """``mj_step2`` of the length of each environment's step, if it is not lost; afterwards the models have ``timestep`` [s] again."""
+        models, datas, options, views = self._models, self._datas, self._options, self._views
+        lengths, lost = views.length[: len(envs)].tolist(), views.lost[: len(envs)].tolist()
+        for row, b in enumerate(envs):
+            if lost[row]:
+                continue
+            options[b].timestep = lengths[row]
+            try:
+                if not self._damping.step(b, models[b], datas[b]):
+                    mujoco.mj_step2(models[b], datas[b])
+            except mujoco.FatalError:
+                self._lose(b, row)
+            finally:
+                options[b].timestep = timestep
+
+    def _lose(self, env: int, row: int) -> None:
+        if self._views.lost[row]:
+            return
+        self._views.lost[row] = 1
+        rule = 'MuJoCo has no memory left for its contacts: raise memory of <size memory="..."/>, or spec.memory'
+        warnings.warn(f"environment {env} failed: {rule}", RuntimeWarning, stacklevel=2)
 
     def end(self) -> None:
         """``GelContact.end`` with the forces and velocities of the rows; environments that broke down are lost."""

@@ -16,6 +16,7 @@ from raytac.world.environment_models import EnvironmentModels
 from raytac.world.rigid_pads import RigidPads
 from raytac.world.sensor_frames import SensorFrames
 from raytac.world.world_model import checked_states, own_world_model
+from raytac.world.world_state import check_controls
 
 if TYPE_CHECKING:
     from raytac.robots.mount import SensorChoice
@@ -40,7 +41,8 @@ class PadStepper:
 
     ``step`` divides a step where something moves fast near a pad, as ``TactileWorld`` does, and leaves the poses of its end. With ``add`` a
     step is as long as the model's, so that what is fast may go through a gel; that is marked in ``failed`` in both. A failed state is not
-    stepped until ``reset``. A state whose time has gone back counts as reset.
+    stepped until ``reset``. A state whose time has gone back counts as reset. With ``add`` a body that was moved by hand has gone there on
+    a straight line, as ``failed`` sees it, until ``reset``.
 
     Attributes:
         model: the model, which is not changed.
@@ -76,7 +78,8 @@ class PadStepper:
         )
         self.failed = np.zeros(num_envs, bool)
         self._frames = SensorFrames(self.composed.sensors, num_envs=num_envs, seed=settings.pop("seed", 0), **settings)
-        self._pads = RigidPads(self.composed, EnvironmentModels(self.composed, num_envs), [mujoco.MjData(model)] * num_envs)
+        self._models = EnvironmentModels(self.composed, num_envs)
+        self._pads = RigidPads(self.composed, self._models, [mujoco.MjData(model)] * num_envs)
         self._time = np.full(num_envs, -np.inf)
         self._put: Any = None
 
@@ -94,7 +97,7 @@ class PadStepper:
         """One step of MuJoCo with the pads' contact, of one state or of B; the controls are in ``data.ctrl``.
 
         Raises:
-            InputError: another model, or another number of states.
+            InputError: another model, timestep or number of states, or a control that is not finite.
         """
         datas = self._states(model, data)
         self._pads.advance(datas, lambda _: None, self.failed)
@@ -106,7 +109,7 @@ class PadStepper:
         Controls and applied forces must have their values of this step: they may close a gap in it.
 
         Raises:
-            InputError: another model, another number of states, or no ``finish`` since the last ``add``.
+            InputError: as ``step``, or no ``finish`` since the last ``add``.
         """
         datas = self._states(model, data)
         if self._put is not None:
@@ -117,13 +120,13 @@ class PadStepper:
         """Read the pads' forces and let the gels shear, after ``mj_step2``.
 
         Raises:
-            InputError: another model, another number of states, or no ``add`` before.
+            InputError: another model, timestep or number of states, no ``add`` before, or another ``mj_step1`` since.
         """
         datas = checked_states(self.model, model, data, len(self.failed))
         if self._put is None:
             raise InputError("finish", value="without add", rule="must follow add and mj_step2")
-        self._pads.finish(datas, self._put, self.failed)
-        self._put = None
+        put, self._put = self._put, None
+        self._pads.finish(datas, put, self.failed)
         self._time[:] = [one.time for one in datas]
 
     def wrench(self, name: str) -> np.ndarray:
@@ -149,8 +152,11 @@ class PadStepper:
         )
 
     def _states(self, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData]) -> list[mujoco.MjData]:
-        """The states; those whose time has gone back are reset."""
+        """The states, whose controls must be finite; those whose time has gone back are reset."""
         datas = checked_states(self.model, model, data, len(self.failed))
+        for b, one in enumerate(datas):
+            check_controls(b, one)
+        self._models.inverse_weight[:] = model.body_invweight0[:, 0]  # masses may have been changed
         back = [b for b, one in enumerate(datas) if one.time < self._time[b]]
         if back:
             self.reset(back)

@@ -37,7 +37,7 @@ from raytac.world.hard_contacts import HARD_MARGIN, is_hard
 from raytac.world.mujoco_rows import MujocoRows
 from raytac.world.pad_surfaces import PadSurfaces
 from raytac.world.world_model import WorldModel
-from raytac.world.world_state import Drive
+from raytac.world.world_state import Drive, lost
 
 _CASE_TRAVEL = 0.8 * HARD_MARGIN
 """Greatest travel of a body beside a case in a step [m]: less than the gap from which their contact is known."""
@@ -50,17 +50,8 @@ class RigidPads:
     meshes: tuple[str, ...] = ()
 
     def __init__(self, composed: WorldModel, models: EnvironmentModels, datas: Sequence[mujoco.MjData], **_: object) -> None:
-        """Pads of ``composed``; ``models``, ``datas``: MuJoCo's of every environment. Coupling and device do not matter here.
-
-        Raises:
-            InputError: the model has pyramidal friction cones, or a noslip pass, which would undo the gel's shear.
-        """
-        num_envs, option = len(datas), composed.model.opt
-        if option.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:
-            raise InputError("option.cone", value="pyramidal", rule="must be elliptic with rigid pads", choices=("elliptic",))
-        if option.noslip_iterations:
-            rule = "must be 0 with rigid pads: the gel sticks by its shear, which a noslip pass would undo"
-            raise InputError("option.noslip_iterations", value=int(option.noslip_iterations), rule=rule)
+        """Pads of ``composed``; ``models``, ``datas``: MuJoCo's of every environment. Physics and device do not matter here."""
+        num_envs = len(datas)
         self.composed, self.model, self._models = composed, composed.model, models
         self._names = [mounted.name for mounted in composed.sensors]
         self.bodies = composed.touched
@@ -110,6 +101,7 @@ class RigidPads:
         )
         self._surfaces = PadSurfaces(dict(zip(self._names, self._gels, strict=True)), shapes, num_envs)
         self.report: dict[str, np.ndarray] = {}
+        self._added: list[tuple[int, int]] = []
 
     def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData], bodies: Mapping[str, np.ndarray] | None = None) -> None:
         """Forget what environments went through; where bodies start, MuJoCo knows.
@@ -136,6 +128,7 @@ class RigidPads:
         """
         scene, ticks = self.composed, self._contact.ticks
         self._bind(datas)
+        failed |= lost(datas)
         self._views.before[:] = np.nan
         # No environment waits for those that take shorter steps.
         total, done = ticks * round(scene.control_timestep / scene.timestep), np.zeros(len(datas), int)
@@ -152,16 +145,12 @@ class RigidPads:
 
     def _step(self, envs: np.ndarray, drive: Drive, done: np.ndarray, failed: np.ndarray) -> np.ndarray:
         """One step of MuJoCo in environments ``envs``, each of its own length; returns the ticks of each, (n,)."""
-        views = self._views
         self._mujoco.first_half(envs.tolist())
         drive(envs)
         self._insert(envs, done)
-        lost, lengths, sound = views.lost[: len(envs)], views.length[: len(envs)], envs
-        if np.count_nonzero(lost):
-            sound, lengths = envs[lost == 0], lengths[lost == 0]
-        self._mujoco.second_half(sound.tolist(), lengths.tolist(), self.composed.timestep)
+        self._mujoco.second_half(envs.tolist(), self.composed.timestep)
         self._finish(envs, failed)
-        return views.ticks[: len(envs)]
+        return self._views.ticks[: len(envs)]
 
     def add(self, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> np.ndarray:
         """Put the pads' contacts into states that somebody else steps, between ``mj_step1`` and ``mj_step2``, with their controls.
@@ -173,16 +162,24 @@ class RigidPads:
         if len(envs):
             self._insert(envs, 0, whole=True)
             self._mark_lost(envs, failed)
+        self._added = self._mujoco.counts(envs.tolist())
         return envs
 
     def finish(self, datas: Sequence[mujoco.MjData], envs: np.ndarray, failed: np.ndarray) -> None:
-        """Read the forces of contacts that ``add`` has put in, and let the gels shear, after ``mj_step2``."""
+        """Read the forces of contacts that ``add`` has put in, and let the gels shear, after ``mj_step2``.
+
+        Raises ``InputError`` if these contacts are gone.
+        """
         self._bind(datas)
+        if self._mujoco.counts(envs.tolist()) != self._added:
+            rule = "must follow the mj_step2 after add: MuJoCo has other contacts now, and those of add are lost; call reset"
+            raise InputError("finish", value="after another mj_step1", rule=rule)
         if len(envs):
             self._finish(envs, failed)
 
     def _bind(self, datas: Sequence[mujoco.MjData]) -> None:
         self._mujoco.bind([self._models[b] for b in range(len(datas))], datas)
+        self._mujoco.check_options(self.composed.timestep)
 
     def _insert(self, envs: np.ndarray, done: np.ndarray | int, *, whole: bool = False) -> None:
         """Put the pads' contacts among MuJoCo's, after ``mj_step1`` and with the controls of the step; ``whole``: it is not divided."""

@@ -17,6 +17,7 @@ from raytac.physics.rigid.search import PadSearch
 from raytac.robots.frames import body_poses, site_poses
 from raytac.robots.mount import MountedSensor
 from raytac.se3 import inverse
+from raytac.world.forbidden_overlap import BondedFaces
 from raytac.world.pad_surfaces import PadSurfaces
 from raytac.world.sensor_frames import SensorFrames
 from raytac.world.world_model import checked_states, own_world_model
@@ -90,6 +91,7 @@ class TactileReader:
         self._frames = SensorFrames(sensors_, num_envs=num_envs, seed=settings.pop("seed", 0), **settings)
         shapes = [body.parts for body in bodies]
         self._surfaces = PadSurfaces({mounted.name: mounted.spec.gelpad for mounted in sensors_}, shapes, num_envs)
+        self._faces = {mounted.name: BondedFaces([mounted.spec.gelpad], shapes) for mounted in sensors_}
         self._body_index = np.array([body.index for body in bodies], int)
         # Entries of one body move together: MuJoCo's force is on the body.
         self._groups = {int(index): np.flatnonzero(self._body_index == index) for index in np.unique(self._body_index)}
@@ -130,6 +132,7 @@ class TactileReader:
         world_from_pad = site_poses(datas, int(self.model.site(mounted.site).id))
         pad_from_body = inverse(world_from_pad)[:, None] @ body_poses(datas, self._body_index)
         wrench, load = self._forces(mounted, datas, world_from_pad)
+        failed |= self._faces[mounted.name].pierced(pad_from_body[:, None]).any(axis=(1, 2))
         if self.depth == "force":
             self._settle(mounted, pad_from_body, load, failed)
         return self._surfaces.reading(mounted.name, grid, pad_from_body, wrench, failed, np.arange(len(datas)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import copy
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -29,7 +30,7 @@ from raytac.world.environment_models import EnvironmentModels, Variation
 from raytac.world.pads import WORLD_PADS, WorldPads
 from raytac.world.sensor_frames import SensorFrames
 from raytac.world.world_model import WorldModel, compiled_model, own_world_model
-from raytac.world.world_state import BatchController, Control, Drive, WorldState
+from raytac.world.world_state import BatchController, Control, Drive, WorldState, check_controls
 
 if TYPE_CHECKING:
     from raytac.markers import MarkersConfig
@@ -103,7 +104,7 @@ class TactileWorld:
             keyframe: name of the keyframe that is the start; None is ``qpos0``.
             allow_overlap: names of geoms in which a gel may lie at the start.
             physics: name or configuration, as ``TactileSensor`` takes it; None is as the scene says, else ``rigid``.
-            coupling: ``two_way`` or ``one_way``; None is as the scene says. The rigid pad acts both ways always.
+            coupling: ``two_way`` or ``one_way``; None is as the scene says. A rigid pad acts both ways always.
             outputs, markers, optics, resolution, device: of every sensor, as ``TactileSensor`` takes them.
             num_envs: number of environments B.
             seed: of every random number.
@@ -142,7 +143,11 @@ class TactileWorld:
         if is_own and self.physics.is_simulated:
             rule = "needs a task scene: bodies of a model of one's own meet rigid pads"
             raise InputError("physics", value=name, rule=rule, choices=("rigid",))
-        self.coupling = coupling or (COUPLINGS[0] if self.scene is None else self.scene.coupling)
+        if coupling == "one_way" and not self.physics.is_simulated:
+            raise InputError(
+                "coupling", value=coupling, rule="is for soft pads: a rigid pad acts both ways", choices=("two_way",)
+            )
+        self.coupling = coupling or (self.scene.coupling if self.scene is not None and self.physics.is_simulated else "two_way")
         self.num_envs, self.device, self.seed = num_envs, device, seed
         self.composed: WorldModel
         if isinstance(scene, (mujoco.MjSpec, mujoco.MjModel)):
@@ -165,7 +170,7 @@ class TactileWorld:
             pitch=pitch,
         )
         self.model = self.composed.model
-        self.data = [mujoco.MjData(self.model) for _ in range(num_envs)]
+        self.data = tuple(mujoco.MjData(self.model) for _ in range(num_envs))
         self.models = EnvironmentModels(self.composed, num_envs)
         self.arm: Arm | None = self.composed.arm
         self._reader = StateReader(self.data, self._numbers())
@@ -175,7 +180,7 @@ class TactileWorld:
             others = np.setdiff1d(np.arange(self.model.nu), self.arm.motors)
             self._holding = self._law.springs(self.data, others.tolist())
             self._holding.aim(self.composed.start[self.arm.qpos], np.zeros(1), np.zeros(1), self.composed.ctrl[others])
-        self._failed = np.zeros(num_envs, bool)
+        self._failed, self._stepped = np.zeros(num_envs, bool), Lock()
         self._start_over(range(num_envs))
         if self.physics.is_simulated:
             check_solver(f"physics={name!r}")
@@ -310,11 +315,19 @@ class TactileWorld:
             control: controllers of the actuators (see ``Control``); None is ``hold``.
 
         Raises:
-            InputError: controls of the wrong shape or number, or not finite; with soft pads, a motion too fast to be resolved near a
+            InputError: another thread steps this world, MuJoCo's timestep or cone were changed, controls of the wrong shape or number, or
+                not finite; with soft pads, a motion too fast to be resolved near a
                 contact, in the only environment, which has failed then. Of several environments the one that moves so fast is marked in
                 ``failed``, with a ``RuntimeWarning``.
         """
-        self._pads.advance(self.data, self._drive(self.hold if control is None else control), self._failed)
+        drive = self._drive(self.hold if control is None else control)
+        if not self._stepped.acquire(blocking=False):
+            rule = "must be stepped by one thread at a time; each thread may have a world of its own"
+            raise InputError("world", value="stepped by another thread", rule=rule)
+        try:
+            self._pads.advance(self.data, drive, self._failed)
+        finally:
+            self._stepped.release()
         return self.state()
 
     @property
@@ -409,6 +422,7 @@ class TactileWorld:
         def call(envs: Sequence[int] | np.ndarray) -> None:
             for b in envs:
                 each[b](self.data[b], float(self.data[b].time))
+                check_controls(b, self.data[b])
 
         return call
 

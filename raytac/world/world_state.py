@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 import mujoco
 import numpy as np
 
+from raytac.errors import InputError
+
 LARGEST_SPEED = 1e4
 """Joint speed [rad/s or m/s] beyond which an environment counts as failed, long before MuJoCo sees a huge number."""
 
@@ -49,6 +51,13 @@ class WorldState:
     """Environments whose physics broke down, shape (B,), bool; they stand still until they are reset."""
     report: dict[str, np.ndarray] = field(default_factory=dict)
     """Report of the pads' solver on this step, each (B,); empty with the rigid pad."""
+
+
+def check_controls(env: int, data: mujoco.MjData) -> None:
+    """Raise ``InputError`` for a control that is not finite: MuJoCo would set all of them to 0."""
+    if not np.isfinite(data.ctrl).all():
+        k = int(np.flatnonzero(~np.isfinite(data.ctrl))[0])
+        raise InputError(f"control[{k}]", value=float(data.ctrl[k]), rule=f"must be finite in environment {env}")
 
 
 def lost(datas: Sequence[mujoco.MjData]) -> np.ndarray:

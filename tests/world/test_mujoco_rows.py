@@ -145,7 +145,7 @@ def test_states_may_be_replaced_by_others() -> None:
     """The kernels follow the states that they are given."""
     world, other = pressed(2), pressed(2)
     for _ in range(3):
-        before, other.data = other.data, [copy(data) for data in other.data]
+        before, other.data = other.data, tuple(copy(data) for data in other.data)
         for data in before:
             data.qpos[:] = data.xpos[:] = data.cvel[:] = np.nan
         world.step()

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from threading import Lock
 from typing import Any
 
 import warp as wp
 
 from raytac.physics.rigid.warp_cache import start_warp
+
+LAUNCH = Lock()
+"""Held by a launch of kernels with tiles. On a CPU Warp keeps these in one place of the process, where two threads would meet."""
 
 
 class Recorded:
@@ -24,4 +28,5 @@ class Recorded:
 
     def __call__(self) -> None:
         """Launch them."""
-        wp.capture_launch(self._graph)
+        with LAUNCH:
+            wp.capture_launch(self._graph)

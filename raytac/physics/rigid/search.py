@@ -12,6 +12,7 @@ from raytac.errors import InputError
 from raytac.physics.rigid.contact_rows import LAST, Rows
 from raytac.physics.rigid.contacts import LAW_POINTS, PadContacts
 from raytac.physics.rigid.law_kernels import BINS
+from raytac.physics.rigid.recorded import LAUNCH
 from raytac.physics.rigid.search_kernels import PITCHES, Work, find_near, measure
 from raytac.physics.rigid.shape_arrays import PadArrays, ShapeArrays
 from raytac.physics.rigid.warp_cache import start_warp
@@ -207,7 +208,8 @@ class PadSearch:
 
     def _measure(self, pairs: int) -> None:
         self._measure_launch.set_param_by_name("pairs", pairs)
-        self._measure_launch.launch()
+        with LAUNCH:
+            self._measure_launch.launch()
 
     def _read(self, rows: int, envs: np.ndarray) -> PadContacts:
         """Those of the first rows that are contacts, copied."""
