@@ -17,7 +17,7 @@ from raytac.gel.surface import make_grid, rest_height
 from raytac.physics.base import PadReading
 from raytac.physics.objects import object_parts
 from raytac.physics.press import CLEARANCE
-from raytac.physics.rigid.load_law import LoadLaw, first_touch, first_touch_z, gap_at_touch, layer_stiffening, reduced_modulus
+from raytac.physics.rigid.load_law import LoadLaw, first_touch, first_touch_z, gap_at_touch, reduced_modulus
 from raytac.physics.rigid.pad import RigidPad
 from raytac.physics.rigid.rig import PressRig
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
@@ -32,6 +32,7 @@ from raytac.specs.sensor import (
     ResponseSpec,
     SensorSpec,
 )
+from tests.ipc.oracles.closed_forms import BondedLayer, Elastic
 
 PAD = GelpadSpec((20e-3, 16e-3), 4e-3, (0.21, 0.135), 2e5, 0.48, 1000.0, 0.8)
 PITCH = 0.15e-3
@@ -86,37 +87,58 @@ def press(scene: PressScene, steps: int = 1, **options: object) -> tuple[RigidPa
     return pad, list(pad.run(steps))
 
 
-def paraboloid_gap(radius: float) -> tuple[np.ndarray, float]:
-    x = np.linspace(-8e-3, 8e-3, 1601)
-    return (x[None, :] ** 2 + x[:, None] ** 2) / (2.0 * radius), (x[1] - x[0]) ** 2
+WIDE = np.linspace(-9e-3, 9e-3, 181)
+DISTANCE = np.hypot(WIDE[None, :] - 0.03e-3, WIDE[:, None] + 0.021e-3)
+LAYER = BondedLayer(Elastic(PAD.youngs_modulus, PAD.poisson_ratio), PAD.thickness)
+
+
+def law_of(gap: np.ndarray, pad: Any = PAD) -> LoadLaw:
+    return LoadLaw(gap, WIDE, WIDE, dataclasses.replace(pad, size=(30e-3, 30e-3)) if pad is PAD else pad)
 
 
 @pytest.mark.parametrize("depth", [0.1e-3, 0.5e-3, 1e-3])
 def test_load_law_is_hertz_on_a_thick_pad(depth: float) -> None:
     thick: Any = SimpleNamespace(**vars(PAD) | {"thickness": 0.4})  # nearly a half-space: thicker than a GelpadSpec may be
     hertz = 4.0 / 3.0 * reduced_modulus(thick) * math.sqrt(4e-3) * depth**1.5
-    assert math.isclose(LoadLaw(*paraboloid_gap(4e-3), thick).force(depth), hertz, rel_tol=0.02)
-    assert LoadLaw(*paraboloid_gap(4e-3), PAD).force(depth) > 1.1 * hertz  # a bonded layer is stiffer
+    assert math.isclose(law_of(DISTANCE**2 / 8e-3, thick).force(depth), hertz, rel_tol=0.02)
+    assert law_of(DISTANCE**2 / 8e-3).force(depth) > 1.1 * hertz  # a bonded layer is stiffer
 
 
-@pytest.mark.parametrize("depth", [0.1e-3, 0.3e-3, 0.6e-3, 1e-3])
-def test_load_law_is_the_bonded_layer_solution_for_a_sphere(depth: float) -> None:
-    radius = 4e-3
-    pad = dataclasses.replace(PAD, poisson_ratio=0.4999)
-    gap, cell = paraboloid_gap(radius)
-    chi = math.sqrt(radius * depth) / pad.thickness  # Dimitriadis et al. 2002, the equation for ν = 0.5, bonded
-    series = 1.0 + 1.133 * chi + 1.283 * chi**2 + 0.769 * chi**3 + 0.0975 * chi**4
-    expected = 16.0 / 9.0 * pad.youngs_modulus * math.sqrt(radius) * depth**1.5 * series
-    assert math.isclose(LoadLaw(gap, cell, pad).force(depth), expected, rel_tol=0.02)
+@pytest.mark.parametrize("radius", [0.4e-3, 1e-3, 2e-3, 4e-3, 6e-3])
+@pytest.mark.parametrize("kind", ["ball", "cone", "disc"])
+def test_load_law_is_that_of_the_bonded_layer(kind: str, radius: float) -> None:
+    """Force 1 % and radius 2 % off the layer without friction, contacts of 0.1 to 1.5 thicknesses."""
+    if kind == "ball":
+        gap, (depth, force) = DISTANCE**2 / 16e-3, LAYER.sphere(8e-3, radius)
+    elif kind == "cone":
+        gap, (depth, force) = 0.2 * DISTANCE, LAYER.cone(0.2, radius)
+    else:
+        gap, depth = np.where(radius > DISTANCE, 0.0, np.inf), 0.2e-3
+        force = float(LAYER.punch_force(radius, depth))
+    law = law_of(gap)
+    assert depth < law.hard_from and law.force(depth) == pytest.approx(force, rel=0.01)
+    assert law.contact_radius(depth) == pytest.approx(radius, rel=0.02)
+
+
+@pytest.mark.parametrize("radius", [1e-3, 4e-3])
+def test_a_flat_face_that_tilts_keeps_its_middle(radius: float) -> None:
+    depth = 0.2e-3
+    for share in (0.1, 0.3, 0.5):  # of the depth that the rim is deeper and higher
+        tilted = np.where(radius > DISTANCE, share * depth * (1.0 + (WIDE - 0.03e-3) / radius), np.inf)
+        force = law_of(tilted).force((1.0 + share) * depth)
+        assert force == pytest.approx(float(LAYER.punch_force(radius, depth)), rel=0.01)
+
+
+def test_nodes_on_the_edges_of_the_pad_stand_for_the_cells_on_it() -> None:
+    x, y = (np.linspace(-0.5 * size, 0.5 * size, round(size / 0.4e-3) + 1) for size in PAD.size)
+    whole = LoadLaw(np.zeros((len(y), len(x))), x, y, PAD)
+    assert np.pi * whole.contact_radius(0.1e-3) ** 2 == pytest.approx(PAD.size[0] * PAD.size[1], rel=1e-3)
 
 
 def test_load_law_of_a_flat_punch_is_linear_and_inverts() -> None:
-    x = np.linspace(-8e-3, 8e-3, 1601)
-    gap = np.where(np.hypot(x[None, :], x[:, None]) < 1e-3, 0.0, np.inf)
-    law = LoadLaw(gap, (x[1] - x[0]) ** 2, PAD)
-    expected = 2.0 * reduced_modulus(PAD) * 1e-3 * float(layer_stiffening(np.array(1e-3), PAD))
+    law = law_of(np.where(DISTANCE < 1e-3, 0.0, np.inf))
     for depth in (0.2e-3, 0.5e-3, 1e-3):
-        assert math.isclose(law.force(depth) / depth, expected, rel_tol=0.01)
+        assert math.isclose(law.force(depth) / depth, law.force(0.1e-3) / 0.1e-3, rel_tol=1e-9)
         assert math.isclose(law.depth_at(law.force(depth)), depth, rel_tol=1e-9)
     assert law.force(-1e-3) == 0.0 and law.contact_radius(0.0) == 0.0
     with pytest.raises(InputError, match="deeper than the pad"):
@@ -362,7 +384,7 @@ def test_a_kept_force_that_would_go_through_the_pad_is_blamed_on_the_stage_that_
     scene = grain(FORCE)
     grid, pose = make_grid(PAD, PITCH), np.eye(4)
     touch = first_touch(object_parts(scene.object), pose, PAD, grid)
-    force = 0.99 * LoadLaw(touch.gap, float(np.prod(grid.pitch)), PAD, touch.deepest).greatest
+    force = 0.99 * LoadLaw(touch.gap, grid.x, grid.y, PAD, touch.deepest).greatest
     stages = StageSpec("indent", force=force), StageSpec("shear", shear=(9e-3, 0.0))
     with pytest.raises(SpecError, match=r"trajectory\[1\]\.shear_mm = .*the force kept here, .* N, would press deeper"):
         press(grain(*stages))

@@ -111,7 +111,7 @@ def test_rows_are_written_where_mujoco_keeps_them_and_their_forces_are_read_ther
             assert one.mu == pytest.approx(one.friction[0] * np.sqrt(inverse[1] / inverse[0]), rel=1e-14)
             wanted = force * inverse - data.efc_vel[rows] / steps[b]
             np.testing.assert_allclose(data.efc_aref[rows], wanted, rtol=1e-13, atol=1e-13 * np.abs(wanted).max())
-    pads._mujoco.second_half(range(3), steps.tolist(), world.composed.timestep)
+    pads._mujoco.second_half(range(3), world.composed.timestep)
     pads._finish(np.arange(3), world._failed)
     for b, data in enumerate(world.data):
         moved = np.zeros(data.nefc)

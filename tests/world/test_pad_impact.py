@@ -174,5 +174,5 @@ def test_two_gels_that_meet_carry_the_same_load_at_half_of_the_overlap_each() ->
     # Half of what one gel carries against a rigid copy of the other at the same overlap.
     gel = load_sensor("gelsight_mini").gelpad
     grid = make_grid(gel, 0.2e-3)
-    law = LoadLaw(-2.0 * grid.rest, float(np.prod(grid.pitch)), gel)
+    law = LoadLaw(-2.0 * grid.rest, grid.x, grid.y, gel)
     assert pressed[0] == pytest.approx(0.5 * law.force(overlap), rel=0.02)

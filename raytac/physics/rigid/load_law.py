@@ -9,6 +9,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import PadGrid, rest_height
+from raytac.physics.rigid.layer_response import layer_response
 from raytac.shapes.part import Part
 from raytac.shapes.underside import object_bounds, object_height
 from raytac.specs.sensor import GelpadSpec
@@ -16,37 +17,15 @@ from raytac.specs.sensor import GelpadSpec
 _TABLE = 512
 _DEPTHS = np.linspace(0.0, 1.0, _TABLE) ** 2
 """Depths of the table over the pad's thickness."""
+SMOOTH = 0.15
+"""Share of a depth, up and down, over which the growth of the force gives the contact's radius."""
+_AT_EDGE = 1e-9
+"""Nodes within this of an edge of the pad are on it [m]."""
 
 
 def reduced_modulus(gelpad: GelpadSpec) -> float:
     """E* = E / (1 − ν²) [Pa] of the gel under a rigid indenter."""
     return gelpad.youngs_modulus / (1.0 - gelpad.poisson_ratio**2)
-
-
-def layer_stiffening(radius: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
-    """Stiffness of the bonded layer relative to a half-space, under a contact of ``radius`` [m].
-
-    From the sphere on a bonded layer, F = F_Hertz Σ c_n χⁿ with χ = √(Rδ) / h (Dimitriadis et al., Biophysical Journal 82, 2002,
-    2798): c₁ = −2α/π, c₂ = 4α²/π², c₃ = −(8/π³)(α³ + 4π²β/15), c₄ = (16α/π⁴)(α³ + 3π²β/5), α and β as below. Its incremental
-    stiffness is 2E*a Σ (1 + n/3) c_n (a/h)ⁿ at a = √(Rδ), and that sum is returned. The series holds for contacts up to about the
-    layer's thickness; beyond, it is held below the stiffness of a layer squeezed without lateral motion, 1 + (π/2)(M/E*)(a/h)
-    with M = E(1 − ν)/((1 + ν)(1 − 2ν)).
-    """
-    nu, ratio = gelpad.poisson_ratio, np.asarray(radius, float) / gelpad.thickness
-    α = -(1.2876 - 1.4678 * nu + 1.3442 * nu**2) / (1.0 - nu)
-    β = (0.6387 - 1.0277 * nu + 1.5164 * nu**2) / (1.0 - nu)
-    series = (
-        1.0,
-        -2.0 * α / np.pi,
-        4.0 * α**2 / np.pi**2,
-        -8.0 / np.pi**3 * (α**3 + 4.0 * np.pi**2 / 15.0 * β),
-        16.0 * α / np.pi**4 * (α**3 + 3.0 * np.pi**2 / 5.0 * β),
-    )
-    stiffening = np.zeros_like(ratio)
-    for n in range(len(series) - 1, -1, -1):  # Horner's scheme: powers are dear
-        stiffening = stiffening * ratio + series[n] * (1.0 + n / 3.0)
-    confined = gelpad.youngs_modulus * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
-    return np.minimum(stiffening, 1.0 + 0.5 * np.pi * confined / reduced_modulus(gelpad) * ratio)
 
 
 HARD_FROM, HARD_RISE = 0.2, 20.0
@@ -106,31 +85,37 @@ def shear_modulus(gelpad: GelpadSpec) -> float:
 class LoadLaw:
     """Normal force, contact radius and tangential stiffness against depth, from the gap between object and resting gel.
 
-    The incremental stiffness of a contact of area A is dF/dδ = 2 E* √(A/π), exact for every axisymmetric indenter on a half-space
-    (Pharr, Oliver & Brotzen, J. Mater. Res. 7, 1992, 613) and within a few percent for other compact ones; here it is multiplied
-    by ``layer_stiffening``. The area at depth δ is taken as that where the gap is below δ/2. This is exact for a paraboloid
-    (πRδ, so Hertz's law on a half-space) and for a flat punch; a cone comes out with π/4 of Sneddon's force. Separate contacts
-    count as one of the same area. Near the bonded face the law grows without bound (``hard_back``). F is strictly increasing in δ and 0 at
-    δ <= 0.
+    A contact that covers a region Ω of the gel has, at a depth δ, the force k(Ω) (δ − ⟨gap⟩): k the stiffness of the flat punch Ω, ⟨gap⟩
+    the mean of the gap at first touch under that punch's pressure (Betti's theorem). The true Ω is that of the greatest force (Barber,
+    J. Elasticity 4, 1974, 171), so a region that is a little off gives nearly the same. Here Ω is sought among the regions where the gap
+    is below a level. Its stiffness is that of a disc of its area on the bonded layer, 2 E* a κ(a) with a = √(A/π). The pressure over its
+    mean is 1 + (12 m − 6)(ρ² − 1/2) + n P₂(x): m and n are ``moment`` and ``bend`` of ``LayerResponse``, ρ is the distance from the
+    region's centroid, ρ² 1/2 in the mean, and x the area of smaller gaps over the region's. On a round contact x is ρ². Under a face that
+    tilts it is not, and ρ keeps its middle in place.
+
+    So the law is that of the layer for flat punches, level or tilted, for paraboloids and for cones. Separate contacts count as one of the
+    same area. Near the bonded face the law grows without bound (``hard_back``). F is strictly increasing in δ and 0 at δ <= 0.
     """
 
-    def __init__(self, gap: np.ndarray, cell_area: float, gelpad: GelpadSpec, deepest: float = np.inf) -> None:
-        """``gap`` [m]: distance along z from the resting gel to the object at first touch, any shape, >= 0, ``inf`` where there
-        is none; ``cell_area`` [m²] of one node; ``deepest`` [m]: where there is gel for, at most the pad's thickness."""
+    def __init__(self, gap: np.ndarray, x: np.ndarray, y: np.ndarray, gelpad: GelpadSpec, deepest: float = np.inf) -> None:
+        """``gap`` (Ny, Nx) [m]: distance along z from the resting gel to the object at first touch, >= 0, ``inf`` where there
+        is none, at evenly spaced places ``x`` (Nx,) and ``y`` (Ny,) in the pad frame [m]; ``deepest`` [m]: where there is gel for, at most
+        the pad's thickness."""
         self._gelpad = gelpad
         self.deepest = min(deepest, gelpad.thickness)
         """Greatest depth that a press may have [m]."""
         self.depth = gelpad.thickness * _DEPTHS
         """Depths of the table [m], 0 to the pad's thickness, denser at the start."""
-        near = np.sort(gap[gap < 0.5 * gelpad.thickness], axis=None)
-        # Count half a node where the gap reaches the limit, so that the area grows continuously from 0 instead of in steps.
-        counts = np.interp(0.5 * self.depth, near, np.arange(len(near)) + 0.5) if len(near) else np.zeros(_TABLE)
-        self.radius = np.sqrt(np.maximum(counts, 0.5) * cell_area / np.pi)
-        """Contact radius of the table [m]: that of a disc of the contact's area."""
-        stiffness = 2.0 * reduced_modulus(gelpad) * self.radius * layer_stiffening(self.radius, gelpad)
-        steps = 0.5 * (stiffness[1:] + stiffness[:-1]) * np.diff(self.depth)
-        self.table = np.concatenate([[0.0], np.cumsum(steps)])
+        stiffness, offset = region_lines(gap, x, y, gelpad)
+
+        def force(depth: np.ndarray) -> np.ndarray:
+            return (stiffness * depth[:, None] - offset).max(axis=1)
+
+        self.table = force(self.depth)
         """Normal force of the table, without the hard back [N]."""
+        step = np.maximum(SMOOTH * self.depth, 1e-12)
+        self.radius = _punch_radius((force(self.depth + step) - force(self.depth - step)) / (2.0 * step), gelpad)
+        """Contact radius of the table [m]: of the flat punch whose force grows as fast, over ``SMOOTH`` of the depth."""
 
     @property
     def greatest(self) -> float:
@@ -189,6 +174,49 @@ class LoadLaw:
     def twist_stiffness(self, depth: float) -> float:
         """Torque per angle [N m/rad] at ``depth`` [m], see ``twist_stiffness``."""
         return float(twist_stiffness(np.asarray(self.contact_radius(depth)), self._gelpad))
+
+
+def region_lines(
+    gap: np.ndarray, x: np.ndarray, y: np.ndarray, gelpad: GelpadSpec, highest: float = np.inf, levels: int = 1024
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stiffness k [N/m] and k ⟨gap⟩ [N] of regions, (n,) each: F = k δ − k ⟨gap⟩ of each, and the contact's is the greatest.
+
+    They are half a node, which stands for a tip between nodes, and all where the gap is below one of ``levels`` up to ``highest`` [m],
+    evenly spaced in their roots. Other arguments are those of ``LoadLaw``.
+    """
+    layer = layer_response(gelpad)
+    step_x, step_y = x[1] - x[0], y[1] - y[0]
+    highest = min(highest, layer.share.max() * gelpad.thickness)
+    j, i = np.nonzero(gap < highest)
+    g, x_near, y_near = gap[j, i], x[i], y[j]
+    # A node on an edge of the pad stands for half a cell, one in a corner for a quarter.
+    at_x, at_y = (np.where(np.abs(v) > 0.5 * size - _AT_EDGE, 0.5, 1.0) for v, size in zip((x, y), gelpad.size, strict=True))
+    weight = at_x[i] * at_y[j]
+    level = (np.sqrt(g / highest) * levels).astype(int)
+    sums = (weight * term for term in (1.0, x_near, y_near, x_near**2 + y_near**2, g))
+    of_level = np.array([np.bincount(level, term, levels) for term in sums])
+    *of_level, of_gap = of_level[:, of_level[0] > 0.0]
+    of_gap /= of_level[0]
+    # Over all nodes up to each level: number and means of x, y and r²; the same times the gap.
+    nodes, *first = np.cumsum(of_level, axis=1)
+    (cx, cy, square), (mean, gap_x, gap_y, gap_square) = np.array(first) / nodes, np.cumsum(of_gap * of_level, axis=1) / nodes
+    from_origin, of_cell = cx**2 + cy**2, (step_x**2 + step_y**2) / 12.0
+    gap_square += -2.0 * (cx * gap_x + cy * gap_y) + (from_origin + of_cell) * mean
+    spread = square - from_origin + of_cell
+    tilted = 0.5 * gap_square / spread  # mean of gap ρ²
+    within = 3.0 * of_cell / spread * (2.0 * tilted - mean)  # by the curvature within a cell
+    ranked, twice = (np.cumsum(of_gap * np.diff(nodes**n, prepend=0.0)) / nodes**n for n in (2, 3))
+    radius = np.sqrt(np.append(0.5, nodes) * step_x * step_y / np.pi)
+    stiffening, moment, bend = layer.at(radius)
+    under = within + mean + (12.0 * moment[1:] - 6.0) * (tilted - 0.5 * mean) + bend[1:] * (2.0 * twice - 3.0 * ranked + mean)
+    stiffness = 2.0 * reduced_modulus(gelpad) * radius * stiffening
+    return stiffness, stiffness * np.append(0.0, np.maximum(under, 0.0))
+
+
+def _punch_radius(stiffness: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
+    """Radius [m] of the flat punch of a stiffness [N/m]."""
+    layer = layer_response(gelpad)
+    return np.interp(stiffness, 2.0 * reduced_modulus(gelpad) * layer.radius * layer.stiffening, layer.radius)
 
 
 _ZOOMS, _FINE = 4, 17

@@ -125,8 +125,8 @@ class RigidPad(PressPad):
         pose[:2, 3] = x, y
         key = pose.tobytes()
         if key not in self._touches:
-            touch, pitch = first_touch(self.parts, pose, self.sensor.gelpad, self.grid), self.grid.pitch
-            self._touches[key] = touch.z, LoadLaw(touch.gap, pitch[0] * pitch[1], self.sensor.gelpad, touch.deepest)
+            touch = first_touch(self.parts, pose, self.sensor.gelpad, self.grid)
+            self._touches[key] = touch.z, LoadLaw(touch.gap, self.grid.x, self.grid.y, self.sensor.gelpad, touch.deepest)
         return self._touches[key]
 
     def _advance(

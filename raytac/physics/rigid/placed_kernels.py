@@ -45,7 +45,7 @@ class Pads:
     lines: wp.array(dtype=wp.vec3d)
     """Place, height of the resting gel and its slope; the gel is the sum of a function of x and one of y (``GelpadSpec.sag``)."""
     law: wp.array2d(dtype=wp.float64)
-    """Constants of the load law (pads, 8)."""
+    """Constants of the load law (pads, n), see ``law_kernels``."""
 
 
 @wp.struct

@@ -11,7 +11,7 @@ import warp as wp
 from raytac.errors import InputError
 from raytac.physics.rigid.contact_rows import LAST, Rows
 from raytac.physics.rigid.contacts import LAW_POINTS, PadContacts
-from raytac.physics.rigid.law_kernels import BINS
+from raytac.physics.rigid.law_kernels import BINS, Sums
 from raytac.physics.rigid.recorded import LAUNCH
 from raytac.physics.rigid.search_kernels import PITCHES, Work, find_near, measure
 from raytac.physics.rigid.shape_arrays import PadArrays, ShapeArrays
@@ -158,8 +158,8 @@ class PadSearch:
         work.placed.count = wp.zeros(blocks, dtype=wp.int32, device=self.device)
         for name, dtype in _PLACED.items():
             setattr(work.placed, name, wp.zeros((blocks, self._shapes.most_parts), dtype=dtype, device=self.device))
-        for name, dtype in (("count", wp.int32), ("low", wp.float64), ("high", wp.float64)):
-            setattr(work.bins, name, wp.zeros((blocks, BINS), dtype=dtype, device=self.device))
+        work.bins.sums = wp.zeros((blocks, BINS), dtype=Sums, device=self.device)
+        work.bins.lines = wp.zeros((blocks, BINS + 1), dtype=wp.vec3d, device=self.device)
         work.gap = wp.zeros((blocks, self._pads.most_nodes), dtype=wp.float64, device=self.device)
         return work
 

@@ -221,11 +221,7 @@ def measure_pair(
         beyond = wp.bool(False)
         if not done and wide and convex:
             # Where the gap may be below what the law counts, and where it may be least.
-            counted = wp.float64(0.0)
-            if least < _0:
-                counted = wp.max(deeper, _HALF * (wp.min(reach, work.ahead) + least))
-            else:
-                counted = wp.max(deeper, wp.min(_HALF * (reach + least), _HALF * work.ahead + least))
+            counted = wp.max(deeper, _HALF * deepest_of(-least, reach, work.ahead, thickness) + least)
             bound, halves = nodes_below(work.gap, block, lane, lanes, n, nx, counted, _NEAR * pitch)
             if halves[0] < NOWHERE and mode == _SEARCH:
                 outer = box_around(pads, fx, fy, i0, j0, halves, step_x, step_y)
@@ -311,14 +307,15 @@ def measure_pair(
     )  # fmt: skip
     clear_bins(work.bins, block, lane, lanes)
     total_of(_0)
-    beyond_law = infinity()
+    nodes_x, nodes_y = wp.int32(pads.nx[pad, level]), wp.int32(pads.ny[pad, level])
+    flat = (pads.lines[fy + 1][0] - pads.lines[fy][0]) / (pads.lines[fx + 1][0] - pads.lines[fx][0])
     k = wp.int32(lane)
     while k < n:
         gap = work.gap[block, k]
         if gap < _INF:
             overlap = shift - gap
+            j = k // nx
             if overlap > _0:
-                j = k // nx
                 u, v = pads.lines[fx + i0 + k - j * nx], pads.lines[fy + j0 + j]
                 s += overlap
                 sx += overlap * u[0]
@@ -334,11 +331,8 @@ def measure_pair(
                 nxy += u[0] * v[0]
                 nyy += v[0] * v[0]
             if _2 * (gap + depth) < deepest:
-                add_node(work.bins, block, wp.max(gap + depth, _0), deepest)
-            else:
-                beyond_law = wp.min(beyond_law, gap + depth)
+                add_node(work.bins, block, wp.max(gap + depth, _0), deepest, i0 + k - j * nx, j0 + j, nodes_x, nodes_y, flat)
         k += lanes
-    beyond_law = least_of(beyond_law)
     s, sx, sy, sz, szz = total_of(s), total_of(sx), total_of(sy), total_of(sz), total_of(szz)
     slope_x, slope_y = total_of(slope_x), total_of(slope_y)
     n1, nx1, ny1, nxx, nxy, nyy = total_of(n1), total_of(nx1), total_of(ny1), total_of(nxx), total_of(nxy), total_of(nyy)
@@ -360,7 +354,7 @@ def measure_pair(
             rows.normal[row] = wp.normalize(wp.vec3d(-slope_x / s, -slope_y / s, wp.float64(1.0)))
         else:
             place_of_gap(pads, pad, refined_x, refined_y, depth, row, rows)
-        tabulate(work.bins, block, beyond_law, deepest, pads.cell[pad, level], pads.law, pad, row, rows.force, rows.radius)
+        tabulate(work.bins, block, deepest, flat, pads.cell[pad, level], pads.law, pad, row, rows.force, rows.radius)
 
 
 @wp.kernel

@@ -10,6 +10,7 @@ import warp as wp
 
 from raytac.errors import InputError
 from raytac.gel.surface import make_grid
+from raytac.physics.rigid.layer_response import layer_response
 from raytac.physics.rigid.load_law import reduced_modulus
 from raytac.physics.rigid.placed_kernels import Pads
 from raytac.physics.rigid.shape_kernels import Shapes
@@ -144,21 +145,11 @@ class PadArrays:
         self.struct = pads
 
 
-def _law(gelpad: GelpadSpec) -> list[float]:
-    """2 E*, thickness, slope of the confined layer's stiffening, and the series of ``layer_stiffening`` from its constant term."""
-    nu, modulus = gelpad.poisson_ratio, reduced_modulus(gelpad)
-    α = -(1.2876 - 1.4678 * nu + 1.3442 * nu**2) / (1.0 - nu)
-    β = (0.6387 - 1.0277 * nu + 1.5164 * nu**2) / (1.0 - nu)
-    series = (
-        1.0,
-        -2.0 * α / np.pi,
-        4.0 * α**2 / np.pi**2,
-        -8.0 / np.pi**3 * (α**3 + 4.0 * np.pi**2 / 15.0 * β),
-        16.0 * α / np.pi**4 * (α**3 + 3.0 * np.pi**2 / 5.0 * β),
-    )
-    confined = gelpad.youngs_modulus * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu))
-    incremental = [c * (1.0 + n / 3.0) for n, c in enumerate(series)]
-    return [2.0 * modulus, gelpad.thickness, 0.5 * np.pi * confined / modulus, *incremental]
+def _law(gelpad: GelpadSpec) -> np.ndarray:
+    """Constants of ``law_kernels``: 2 E*, radius of the widest contact, and entries of the response."""
+    layer = layer_response(gelpad)
+    entries = np.stack([layer.stiffening, layer.moment, layer.bend], axis=1).ravel()
+    return np.concatenate([[2.0 * reduced_modulus(gelpad), layer.radius[-1]], entries])
 
 
 def _array(values: Any, dtype: Any, device: wp.Device) -> wp.array:

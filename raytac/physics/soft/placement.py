@@ -73,7 +73,7 @@ class PressPlacement:
         """Force over depth [N/m] by the bonded layer's law at ``force`` [N]: a first guess."""
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = about_z(twist) @ self._rotations[b], self.origin[b]
-        law = LoadLaw(gap_at_touch(self._parts, pose, self._grid), self._grid.pitch[0] * self._grid.pitch[1], self._gelpad)
+        law = LoadLaw(gap_at_touch(self._parts, pose, self._grid), self._grid.x, self._grid.y, self._gelpad)
         return law.secant_stiffness(law.depth_at(min(max(force, 1e-3), law.greatest)))
 
     def _check_stages(self, scene: PressScene) -> None:

@@ -110,6 +110,15 @@ class BondedLayer:
         depth = bowl[-1] / flat[-1]
         return float(depth), float(np.pi * self.solid.plane_strain * (w @ (depth * flat - bowl)))
 
+    def cone(self, slope: float, contact_radius: float) -> tuple[float, float]:
+        """Depth [m] and force [N] at which a cone of that slope against the surface touches over ``contact_radius``: φ(a) = 0 again, with
+        g = δ − slope π s/2."""
+        s, w = self._nodes(contact_radius)
+        s, w = np.append(s, contact_radius), np.append(w, 0.0)
+        flat, tip = self._solve(np.ones_like(s), s, w), self._solve(0.5 * np.pi * slope * s, s, w)
+        depth = tip[-1] / flat[-1]
+        return float(depth), float(np.pi * self.solid.plane_strain * (w @ (depth * flat - tip)))
+
     def sphere_force(self, sphere_radius: float, depth: float) -> float:
         """Force [N] of a paraboloid at ``depth`` [m]."""
         contact = np.sqrt(sphere_radius * depth)

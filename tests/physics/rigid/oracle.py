@@ -94,7 +94,7 @@ class ReferenceSearch:
         depth = float(touches.depth[k]) - shift
         clearance = float(refined(under[None], pitch)[0]) + gelpad.thickness
         gap = under - grid.rest
-        law = LoadLaw(np.maximum(gap + depth, 0.0), float(touches.cell[k]), gelpad)
+        law = LoadLaw(np.maximum(gap + depth, 0.0), grid.x, grid.y, gelpad)
         deepest = min(max(depth + clearance, 1e-5), gelpad.thickness)
         at = deepest * (np.arange(LAW_POINTS) / (LAW_POINTS - 1)) ** 2
         spread = np.zeros(3)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from raytac.gel.surface import make_grid
+from raytac.physics.rigid.layer_response import LayerResponse
 from raytac.physics.rigid.load_law import LoadLaw
 from raytac.shapes.part import Part
 from raytac.shapes.primitives import bounds
@@ -48,12 +49,16 @@ class Touches:
     body, or none within ``clear`` of the gel."""
     cell: np.ndarray
     """Area of one node of each [m²], (n,)."""
+    x: tuple[np.ndarray, ...]
+    """Of each, the nodes along x [m], (Nx,)."""
+    y: tuple[np.ndarray, ...]
     clear: np.ndarray
     """Up to where each ``gap`` is known [m], (n,)."""
 
-    def known_depth(self, k: int) -> float:
-        """Depth [m] up to which a load law of the k-th follows from its gap: that law uses nodes within half the depth."""
-        return 2.0 * float(self.depth[k] + self.clear[k])
+    def known_depth(self, k: int, layer: LayerResponse) -> float:
+        """Depth [m] up to which a load law of the k-th follows from its gap: where all nodes whose gap is known are in contact."""
+        radius = np.sqrt(np.count_nonzero(self.gap[k] < self.clear[k]) * self.cell[k] / np.pi)
+        return float((self.depth[k] + self.clear[k]) / np.interp(radius, layer.radius, layer.share))
 
 
 def least_width(parts: Sequence[Part], pose: np.ndarray) -> float:
@@ -123,7 +128,7 @@ class PadOverlap:
 
     def law(self, touches: Touches, k: int) -> LoadLaw:
         """Load law of the body in the k-th environment that touches, at this place and angle."""
-        return LoadLaw(np.maximum(touches.gap[k] + touches.depth[k], 0.0), float(touches.cell[k]), self._gelpad)
+        return LoadLaw(np.maximum(touches.gap[k] + touches.depth[k], 0.0), touches.x[k], touches.y[k], self._gelpad)
 
 
 @dataclass(frozen=True)
@@ -225,7 +230,9 @@ class _Nodes:
         normal = np.stack([-slope_x, -slope_y, np.ones(len(values))], axis=1)
         normal /= np.sqrt(np.vecdot(normal, normal))[:, None]
         cell, clear = np.full(len(values), self.cell), np.full(len(values), self.near)
-        return Touches(env, -refined(values, self.pitch), np.stack([x, y, height], axis=1), normal, tuple(values), cell, clear)
+        centre, lines = np.stack([x, y, height], axis=1), (self.x[columns], self.y[rows])
+        at_x, at_y = (tuple(np.broadcast_to(line, (len(values), line.shape[1]))) for line in lines)
+        return Touches(env, -refined(values, self.pitch), centre, normal, tuple(values), cell, at_x, at_y, clear)
 
 
 def _window(line: np.ndarray, at: np.ndarray, nodes: int) -> np.ndarray:
@@ -260,13 +267,13 @@ def _joined(touches: Sequence[Touches]) -> Touches:
         return touches[0]
     if not touches:
         nothing = np.zeros(0)
-        return Touches(np.zeros(0, int), nothing, np.zeros((0, 3)), np.zeros((0, 3)), (), nothing, nothing)
+        return Touches(np.zeros(0, int), nothing, np.zeros((0, 3)), np.zeros((0, 3)), (), nothing, (), (), nothing)
     env, depth, centre, normal, cell, clear = (
         np.concatenate([getattr(some, name) for some in touches])
         for name in ("env", "depth", "centre", "normal", "cell", "clear")
     )
-    gap = [one for some in touches for one in some.gap]
     order = np.argsort(env)
-    return Touches(
-        env[order], depth[order], centre[order], normal[order], tuple(gap[k] for k in order), cell[order], clear[order]
+    gap, x, y = (
+        tuple(np.array([k for some in touches for k in getattr(some, name)], object)[order]) for name in ("gap", "x", "y")
     )
+    return Touches(env[order], depth[order], centre[order], normal[order], gap, cell[order], x, y, clear[order])

@@ -11,8 +11,10 @@ import trimesh
 
 from raytac.errors import InputError
 from raytac.gel.surface import make_grid
-from raytac.physics.rigid import load_law
 from raytac.physics.rigid.contacts import LAW_POINTS, PadContacts
+from raytac.physics.rigid.law_kernels import BINS
+from raytac.physics.rigid.layer_response import layer_response
+from raytac.physics.rigid.load_law import region_lines
 from raytac.physics.rigid.search import PadSearch
 from raytac.se3 import rotations
 from raytac.shapes.part import Part, mesh_part, primitive
@@ -115,14 +117,14 @@ def same(one: PadContacts, other: PadContacts) -> None:
 
 
 @pytest.mark.parametrize("gelpad", [DOME, FLAT], ids=["dome", "flat"])
-def test_contacts_are_those_of_the_reference(gelpad: GelpadSpec, monkeypatch: pytest.MonkeyPatch) -> None:
-    """250 random bodies on each gelpad: depth 1 µm, centroid 5 µm, force 0.5 %."""
+def test_contacts_are_those_of_the_reference(gelpad: GelpadSpec) -> None:
+    """250 random bodies on each gelpad: depth 1 µm, centroid 5 µm, force 0.5 %.
+
+    That is between the same levels of the gap. Of few nodes, more levels find a region of more force: by 1.5 nodes' share at most.
+    """
     bodies, poses = pressed(gelpad, 250, seed=7)
     contacts = PadSearch([gelpad], bodies, num_envs=1).contacts(poses[None, None], np.array([0]), REACH)
     np.testing.assert_array_equal(contacts.body, np.arange(len(bodies)))
-    # The law's integral on so many depths that it is exact.
-    monkeypatch.setattr(load_law, "_TABLE", 20_000)
-    monkeypatch.setattr(load_law, "_DEPTHS", np.linspace(0.0, 1.0, 20_000) ** 2)
     grid, missed = make_grid(gelpad, 0.2e-3), 0
     for k, body in enumerate(bodies):
         overlap = PadOverlap(gelpad, least_width(body, poses[k]))
@@ -141,8 +143,17 @@ def test_contacts_are_those_of_the_reference(gelpad: GelpadSpec, monkeypatch: py
         depths = contacts.deepest[k] * np.linspace(0.0, 1.0, LAW_POINTS) ** 2
         at = np.flatnonzero((depths > 0.8 * depth) & (depths <= (1.0 + 1e-9) * min(depth, gelpad.thickness)))
         assert len(at) and contacts.deepest[k] > depth
-        np.testing.assert_allclose(contacts.force[k, at], [law.force(d) for d in depths[at]], rtol=5e-3, err_msg=name)
-        np.testing.assert_allclose(contacts.radius[k, at], [law.contact_radius(d) for d in depths[at]], rtol=5e-3, err_msg=name)
+        gap = np.maximum(touches.gap[0] + depth, 0.0)
+        slope, offset = region_lines(gap, touches.x[0], touches.y[0], gelpad, 0.5 * contacts.deepest[k], BINS)
+        force = (slope * depths[at, None] - offset).max(axis=1)
+        np.testing.assert_allclose(contacts.force[k, at], force, rtol=5e-3, err_msg=name)
+        nodes = np.count_nonzero(touches.gap[0] < 0.0)
+        finely = [law.force(d) for d in depths[at]]
+        np.testing.assert_allclose(contacts.force[k, at], finely, rtol=5e-3 + 1.5 / nodes, err_msg=name)
+        # Of contacts wider than the gel is thick, not all nodes count that the radius would need.
+        for radius, d in zip(contacts.radius[k, at], depths[at], strict=True):
+            wide = law.contact_radius(d) > gelpad.thickness
+            assert radius == pytest.approx(law.contact_radius(d), rel=(5e-2 if wide else 2e-2) + 2.0 / nodes), name
     assert missed <= 3
 
 
@@ -253,13 +264,39 @@ def test_an_edge_is_as_deep_as_it_is() -> None:
     assert (found.depth > 0.3e-3 - 0.5 * 0.82e-3 * slope - 1e-9).all()
 
 
+@pytest.mark.parametrize("radius", [1.5e-3, 4e-3])
+def test_a_flat_face_that_tilts_keeps_its_middle(radius: float) -> None:
+    """A tilt in full contact changes the force at a depth of the middle by less than 2 %."""
+    depth, poses = 0.13e-3, np.tile(np.eye(4), (3, 1, 1))
+    for pose, share in zip(poses, (0.0, 0.25, 0.5), strict=True):
+        tilt = share * depth / radius
+        pose[:3, :3] = rotations(np.array([[tilt, 0.5 * tilt, 0.0]]) / math.sqrt(1.25))[0]
+        pose[2, 3] = 2e-3 - depth
+    contacts = search_one(FLAT, [primitive("cylinder", (radius, 2e-3))], poses)
+    at = contacts.deepest[:, None] * np.linspace(0.0, 1.0, LAW_POINTS) ** 2
+    force = [np.interp(d, line, row) for d, line, row in zip(contacts.depth, at, contacts.force, strict=True)]
+    assert contacts.depth[2] > 1.4 * depth
+    np.testing.assert_allclose(force, force[0], rtol=0.02)
+
+
+def test_nodes_on_the_edges_of_the_pad_stand_for_the_cells_on_it() -> None:
+    pose = np.eye(4)
+    pose[1, 1] = pose[2, 2] = -1.0
+    pose[2, 3] = -0.1e-3
+    contacts = search_one(FLAT, [primitive("plane")], pose[None])
+    assert np.pi * contacts.radius[0, -1] ** 2 == pytest.approx(FLAT.size[0] * FLAT.size[1], rel=1e-3)
+
+
 def test_the_hole_of_a_torus_and_the_hollow_of_a_cup_stay_open() -> None:
     ring = np.eye(4)
     ring[2, 3] = 1e-3 - 0.2e-3
     torus = search_one(FLAT, [primitive("torus", (5e-3, 1e-3))], ring[None])
     np.testing.assert_allclose(torus.centre[0, :2], 0.0, atol=1e-9)
-    area = np.pi * (5e-3 + math.sqrt(2 * 1e-3 * 0.1e-3)) ** 2 - np.pi * (5e-3 - math.sqrt(2 * 1e-3 * 0.1e-3)) ** 2
     k = int(np.argmin(np.abs(torus.deepest[0] * np.linspace(0.0, 1.0, LAW_POINTS) ** 2 - 0.2e-3)))
+    half = math.sqrt(
+        2 * 1e-3 * 0.2e-3 * float(np.interp(torus.radius[0, k], layer_response(FLAT).radius, layer_response(FLAT).share))
+    )
+    area = np.pi * (5e-3 + half) ** 2 - np.pi * (5e-3 - half) ** 2
     assert np.pi * torus.radius[0, k] ** 2 == pytest.approx(area, rel=0.05)
     walls = [
         primitive("box", size, translated(at))

@@ -10,7 +10,8 @@ import numpy as np
 from raytac.gel.components import span
 from raytac.gel.interpolate import sampled
 from raytac.gel.matmul import product, sandwich
-from raytac.physics.soft.correction.layer import CosineSeries, layer_shear
+from raytac.physics.bonded_layer import layer_shear
+from raytac.physics.soft.correction.cosine_series import CosineSeries
 from raytac.physics.soft.correction.normal import NormalContact, NormalCorrection
 from raytac.specs.sensor import GelpadSpec
 

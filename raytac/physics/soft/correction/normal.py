@@ -9,8 +9,9 @@ import numpy as np
 from raytac.gel.components import span
 from raytac.gel.interpolate import SplineAxis, hat_matrix
 from raytac.gel.matmul import product, sandwich
+from raytac.physics.bonded_layer import layer_compliance
 from raytac.physics.soft.coat_surface import CoatPlaces, CoatSurface
-from raytac.physics.soft.correction.layer import CosineSeries, layer_compliance
+from raytac.physics.soft.correction.cosine_series import CosineSeries
 from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
 from raytac.specs.sensor import GelpadSpec
 

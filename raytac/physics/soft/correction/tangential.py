@@ -6,8 +6,8 @@ import numpy as np
 
 from raytac.gel.interpolate import sampled
 from raytac.gel.matmul import product, sandwich
+from raytac.physics.bonded_layer import layer_compliance, layer_spread
 from raytac.physics.soft.correction.friction import FrictionCorrection, PlaneMotion, plane_displacement, plane_waves
-from raytac.physics.soft.correction.layer import layer_compliance, layer_spread
 from raytac.physics.soft.correction.normal import NormalContact, NormalCorrection
 from raytac.specs.sensor import GelpadSpec
 

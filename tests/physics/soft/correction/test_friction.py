@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from raytac.gel.surface import make_grid
+from raytac.physics.bonded_layer import layer_shear
 from raytac.physics.soft.coat_surface import CoatSurface
 from raytac.physics.soft.correction import friction
 from raytac.physics.soft.correction.friction import FrictionCorrection, PlaneMotion, plane_displacement
-from raytac.physics.soft.correction.layer import layer_shear
 from raytac.physics.soft.correction.mesh_compliance import coat_compliance
 from raytac.physics.soft.correction.normal import NormalCorrection
 from raytac.physics.soft.correction.tangential import TangentialCorrection, _share

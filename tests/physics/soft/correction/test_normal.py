@@ -10,8 +10,9 @@ import pytest
 
 from raytac.gel.interpolate import sampled
 from raytac.gel.surface import make_grid
+from raytac.physics.bonded_layer import layer_compliance, layer_spread
 from raytac.physics.soft.coat_surface import CoatSurface
-from raytac.physics.soft.correction.layer import CosineSeries, layer_compliance, layer_spread
+from raytac.physics.soft.correction.cosine_series import CosineSeries
 from raytac.physics.soft.correction.mesh_compliance import coat_compliance, rest_stiffness
 from raytac.physics.soft.correction.normal import ContactSampler, NormalCorrection, _smoothing
 from raytac.physics.soft.correction.tangential import TangentialCorrection
@@ -162,7 +163,7 @@ def test_a_linear_solution_of_the_mesh_is_exchanged_wholly(fine):
     force = (shape.pressure * np.prod(grid.pitch)).sum()
     from raytac.physics.rigid.load_law import LoadLaw
 
-    law = LoadLaw(np.maximum(ball(grid, 0.0) - grid.rest, 0.0), float(np.prod(grid.pitch)), GELPAD)
+    law = LoadLaw(np.maximum(ball(grid, 0.0) - grid.rest, 0.0), grid.x, grid.y, GELPAD)
     assert force == pytest.approx(law.force(0.6e-3), rel=0.1)
 
 

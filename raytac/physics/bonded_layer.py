@@ -20,8 +20,14 @@ def layer_compliance(wave_number: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
     waves that is the half-space's 2 (1 − ν²)/(E k). For k → 0 it is h (1 + ν)(1 − 2ν)/(E (1 − ν)), uniaxial compression.
     """
     young, nu = gelpad.youngs_modulus, gelpad.poisson_ratio
-    inverse_k, α, κ, determinant = _layer(wave_number, gelpad)
-    return 2.0 * (1.0 - nu**2) / young * (κ * np.sinh(2.0 * α) - 2.0 * α) / determinant * inverse_k
+    inverse_k, α, _, _ = _layer(wave_number, gelpad)
+    return 2.0 * (1.0 - nu**2) / young * relative_compliance(α, nu) * inverse_k
+
+
+def relative_compliance(ratio: np.ndarray, nu: float) -> np.ndarray:
+    """``layer_compliance`` over that of a half-space, at each wave number times thickness, of at most 20."""
+    κ = 3.0 - 4.0 * nu
+    return (κ * np.sinh(2.0 * ratio) - 2.0 * ratio) / _determinant(ratio, nu)
 
 
 def layer_spread(wave_number: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
@@ -52,33 +58,9 @@ def _layer(wave_number: np.ndarray, gelpad: GelpadSpec) -> tuple[np.ndarray, np.
     """1/k, α = k h within bounds, K, and the denominator of all three laws."""
     nu, thickness = gelpad.poisson_ratio, gelpad.thickness
     wave_number = np.maximum(np.asarray(wave_number, float), _LONG / thickness)
-    α, κ = np.minimum(wave_number * thickness, _DEEP), 3.0 - 4.0 * nu
-    return 1.0 / wave_number, α, κ, κ * np.cosh(2.0 * α) + 2.0 * α**2 + 5.0 - 12.0 * nu + 8.0 * nu**2
+    α = np.minimum(wave_number * thickness, _DEEP)
+    return 1.0 / wave_number, α, 3.0 - 4.0 * nu, _determinant(α, nu)
 
 
-class CosineSeries:
-    """Cosine series through values at evenly spaced nodes, with zero slope at both edges."""
-
-    def __init__(self, nodes: np.ndarray) -> None:
-        """``nodes`` [m], shape (n,), evenly spaced from one edge to the other."""
-        n = len(nodes)
-        self._start, self._length = float(nodes[0]), float(nodes[-1] - nodes[0])
-        self.wave_numbers = np.pi * np.arange(n) / self._length
-        """[rad/m], shape (n,)."""
-        half = np.ones(n)
-        half[[0, -1]] = 0.5
-        order = np.arange(n)
-        self.analysis = 2.0 * half[:, None] * half * np.cos(np.pi * np.outer(order, order) / (n - 1)) / (n - 1)
-        """Matrix from values at the nodes to amplitudes, shape (n, n)."""
-        self.sine_analysis = 2.0 * np.sin(np.pi * np.outer(order, order) / (n - 1)) / (n - 1)
-        """The same for sines, which are 0 at the ends, shape (n, n)."""
-        self.hat = np.sinc(0.5 * order / (n - 1)) ** 2
-        """Amplitudes of hat functions on the nodes over those of the cosines through the same values, shape (n,)."""
-
-    def synthesis(self, t: np.ndarray) -> np.ndarray:
-        """Matrix from amplitudes to values at ``t`` [m], shape (P, n)."""
-        return np.cos(np.outer(np.asarray(t) - self._start, self.wave_numbers))
-
-    def sines(self, t: np.ndarray) -> np.ndarray:
-        """Sines of the same wave numbers at ``t`` [m], shape (P, n)."""
-        return np.sin(np.outer(np.asarray(t) - self._start, self.wave_numbers))
+def _determinant(α: np.ndarray, nu: float) -> np.ndarray:
+    return (3.0 - 4.0 * nu) * np.cosh(2.0 * α) + 2.0 * α**2 + 5.0 - 12.0 * nu + 8.0 * nu**2
