@@ -26,6 +26,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -33,6 +34,7 @@ import numpy as np
 import warp as wp
 
 from raytac.errors import BackendError, InputError
+from raytac.physics.rigid.recorded import Recorded
 from raytac.robots.arm import Arm
 from raytac.robots.arm_kernels import Servo, servo_step
 from raytac.robots.states import StateReader
@@ -292,12 +294,11 @@ class _ServoBatch:
         servo.duration = _numbers(np.zeros(1))
         self._target, self._twist, self._duration = servo.target.numpy(), servo.twist.numpy(), servo.duration.numpy()
         self._results = servo.step.numpy(), servo.velocity.numpy()
-        self._step: Any = wp.launch(servo_step, dim=count, inputs=[servo], device="cpu", record_cmd=True)
+        self._step = Recorded(self.reader.launch, partial(wp.launch, servo_step, dim=count, inputs=[servo], device="cpu"))
 
     def targets(self, world_from_target: np.ndarray, twist: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
         self._target[:], self._twist[:], self._duration[:] = world_from_target, twist, duration
-        self.reader.read()
-        self._step.launch()
+        self._step()
         step, velocity = self._results
         return step.copy(), velocity.copy()
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from functools import partial
 
 import mujoco
 import numpy as np
 import warp as wp
 
 from raytac.errors import InputError
+from raytac.physics.rigid.recorded import Recorded
 from raytac.robots.arm import Arm
 from raytac.robots.arm_kernels import Springs, joint_springs
 from raytac.robots.states import ControlWriter, StateReader
@@ -43,7 +44,8 @@ class JointSprings:
         self._target, self._speed = springs.target.numpy(), springs.target_speed.numpy()
         self._start, controls = springs.start.numpy(), springs.torque.numpy()
         self._torque, self._others = controls[:, :n], controls[:, n:]
-        self._law: Any = wp.launch(joint_springs, dim=(count, n), inputs=[springs], device="cpu", record_cmd=True)
+        law = partial(wp.launch, joint_springs, dim=(count, n), inputs=[springs], device="cpu")
+        self._law = Recorded(self._reader.launch, law)
 
     def is_for(self, datas: Sequence[mujoco.MjData]) -> bool:
         """True if it was made for these states."""
@@ -58,8 +60,7 @@ class JointSprings:
 
     def torque(self) -> np.ndarray:
         """Torques (B, n) [N·m] for the present states; the array is overwritten by the next call."""
-        self._reader.read()
-        self._law.launch()
+        self._law()
         return self._torque
 
     def drive(self, envs: Sequence[int] | np.ndarray) -> None:

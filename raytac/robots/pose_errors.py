@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
 
 import numpy as np
 import warp as wp
 
+from raytac.physics.rigid.recorded import Recorded
 from raytac.physics.rigid.warp_cache import start_warp
 from raytac.robots.arm_kernels import pose_errors
 
@@ -22,7 +23,7 @@ class PoseErrors:
         error = wp.zeros((size, 6), dtype=wp.float64, device="cpu")
         self._a, self._b = (array.numpy().reshape(pairs, count, 4, 4) for array in (a, b))
         self._error = error.numpy().reshape(pairs, count, 6)
-        self._launch: Any = wp.launch(pose_errors, dim=size, inputs=[a, b], outputs=[error], device="cpu", record_cmd=True)
+        self._launch = Recorded(partial(wp.launch, pose_errors, dim=size, inputs=[a, b], outputs=[error], device="cpu"))
 
     def __call__(self, *pairs: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         """Displacements (pairs, B, 6) from the second pose of each pair to the first, world axes.
@@ -31,5 +32,5 @@ class PoseErrors:
         """
         for k, (a, b) in enumerate(pairs):
             self._a[k], self._b[k] = a, b
-        self._launch.launch()
+        self._launch()
         return self._error.copy()

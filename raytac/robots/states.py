@@ -11,6 +11,7 @@ import functools
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -18,6 +19,7 @@ import numpy as np
 import warp as wp
 
 from raytac.errors import BackendError, InputError
+from raytac.physics.rigid.recorded import Recorded
 from raytac.physics.rigid.warp_cache import start_warp
 from raytac.robots.state_kernels import Entries, read_numbers, write_numbers
 
@@ -66,6 +68,8 @@ class StateReader:
 
     Attributes:
         arrays: Warp arrays (B, …) of float64 by name; they are overwritten by the next ``read``.
+        read: reads all numbers into ``arrays``.
+        launch: the same, to be recorded with what works on them.
     """
 
     def __init__(self, datas: Sequence[mujoco.MjData], members: Mapping[str, Numbers]) -> None:
@@ -101,19 +105,16 @@ class StateReader:
         entries.places, entries.values = wp.array(places, dtype=wp.uint64, device="cpu"), self._flat
         for name, column in (("member", member), ("index", index), ("start", start), ("stride", stride)):
             setattr(entries, name, wp.array(column, dtype=wp.int32, device="cpu"))
-        self._read: Any = wp.launch(read_numbers, dim=count, inputs=[entries], device="cpu", record_cmd=True)
+        self.launch = partial(wp.launch, read_numbers, dim=count, inputs=[entries], device="cpu")
+        self.read = Recorded(self.launch)
 
     def reads(self, datas: Sequence[mujoco.MjData]) -> bool:
         """True if it reads these states."""
         return len(datas) == len(self._datas) and all(map(operator.is_, datas, self._datas))
 
-    def read(self) -> None:
-        """Read all numbers into ``arrays``."""
-        self._read.launch()
-
     def values(self) -> dict[str, np.ndarray]:
         """Read all numbers; new NumPy arrays (B, …) by name."""
-        self._read.launch()
+        self.read()
         copied = self._values.copy()
         return {key: copied[part].reshape(shape) for key, (part, shape) in self._parts.items()}
 
@@ -136,7 +137,7 @@ class ControlWriter:
         self._mask = self._chosen.numpy()
         places = wp.array([_place(data, "ctrl") for data in self._datas], dtype=wp.uint64, device="cpu")
         inputs = [places, wp.array(list(actuators), dtype=wp.int32, device="cpu"), self.controls, self._chosen]
-        self._write: Any = wp.launch(write_numbers, dim=self.controls.shape, inputs=inputs, device="cpu", record_cmd=True)
+        self._write = Recorded(partial(wp.launch, write_numbers, dim=self.controls.shape, inputs=inputs, device="cpu"))
 
     def writes(self, datas: Sequence[mujoco.MjData]) -> bool:
         """True if it writes to these states."""
@@ -150,7 +151,7 @@ class ControlWriter:
             return next(row for row in chosen if not np.isfinite(row).all())
         self._mask[:] = 0
         self._mask[envs] = 1
-        self._write.launch()
+        self._write()
         return None
 
 

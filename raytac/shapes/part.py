@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -49,6 +50,13 @@ class Part:
     """Relief only: greatest slope of the elevation."""
     joined: bool = False
     """True if it is one solid with the object's first part and starts at that part's flat lower face, z = 0 in the object frame."""
+
+    @cached_property
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centre and half edges (3,) [m] of the box about the vertices of a mesh or relief, along the axes of the part."""
+        assert self.vertices is not None
+        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
+        return 0.5 * (low + high), 0.5 * (high - low)
 
 
 def primitive(kind: str, size: tuple[float, ...] = (), object_from_part: np.ndarray | None = None) -> Part:

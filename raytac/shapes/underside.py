@@ -13,6 +13,8 @@ from raytac.shapes.primitives import UNDERSIDES, bounds, radius_about_origin
 from raytac.shapes.rasterize import lowest_of_triangles
 from raytac.shapes.relief import looks_down, relief_underside
 
+_SLACK = 1e-9
+"""Boxes are widened by this [m] against rounding."""
 _NODES = 32768
 """Nodes of all environments that are processed at once, so that they stay in a core's cache."""
 
@@ -79,6 +81,13 @@ def _part_bounds(part: Part, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return bounds(part.kind, part.size, pose)
 
 
+def _box_of_vertices(part: Part, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds (3,) [m] of a mesh or relief that need no vertex to be placed; those of a tilted one are wider than it is."""
+    centre, half = part.box
+    middle, reach = pose[:3, :3] @ centre + pose[:3, 3], np.abs(pose[:3, :3]) @ half + _SLACK
+    return middle - reach, middle + reach
+
+
 def _lower_onto(lowest: np.ndarray, part: Part, poses: np.ndarray, x: np.ndarray, y: np.ndarray, below: float) -> None:
     """Take the minimum of ``lowest`` (B, Ny, Nx) and the part's underside, in place."""
     if part.kind in UNDERSIDES:
@@ -123,6 +132,9 @@ def _box_below(part: Part, poses: np.ndarray, low: np.ndarray, high: np.ndarray,
 def _lower_surface_onto(lowest: np.ndarray, part: Part, pose: np.ndarray, x: np.ndarray, y: np.ndarray, below: float) -> None:
     """As ``_lower_onto``, of a mesh or relief in one environment, within its bounding box; ``lowest`` (Ny, Nx)."""
     assert part.vertices is not None and part.faces is not None
+    near, far = _box_of_vertices(part, pose)
+    if near[2] > below or far[0] < x[0] or near[0] > x[-1] or far[1] < y[0] or near[1] > y[-1]:
+        return
     as_triangles = part.kind == "mesh" or not looks_down(part, pose)
     placed = part.vertices @ pose[:3, :3].T + pose[:3, 3] if as_triangles else None
     low, high = _part_bounds(part, pose) if placed is None else np.array([[line.min(), line.max()] for line in placed.T]).T

@@ -129,6 +129,8 @@ def read_frames(
     """
     row, k = wp.tid()
     env, body = steps.envs[row], bodies[k]
+    if env < 0:
+        return
     place, turn = wp.vec3d(), wp.mat33d()
     if k < sites.shape[0]:
         place = vector(doubles(memory, env, memory.site_xpos), sites[k])
@@ -159,10 +161,10 @@ def read_frames(
 def write_contacts(memory: Memory, steps: Steps, slots: Slots, gels: wp.array(dtype=wp.int32), others: wp.array(dtype=wp.int32)):
     """Fill the last contacts with those of the slots that are held. ``gels``, ``others``: geoms of the pads and of all that they touch."""
     i = wp.tid()
-    env = steps.envs[i]
-    k = number(memory, env, memory.ncon) - steps.contacts[i]
     if steps.lost[i] != 0 or steps.contacts[i] == 0:
         return
+    env = steps.envs[i]
+    k = number(memory, env, memory.ncon) - steps.contacts[i]
     contact = doubles(memory, env, memory.contact)
     integer = integers(memory, env, memory.contact)
     for pad in range(slots.held.shape[1]):

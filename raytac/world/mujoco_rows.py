@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import mujoco
 import numpy as np
 import warp as wp
 
-from raytac.physics.rigid.gel_contact import GelContact, Launch
+from raytac.physics.rigid.gel_contact import GelContact
+from raytac.physics.rigid.recorded import Recorded
 from raytac.physics.rigid.world_kernels import ROWS
+from raytac.world.implicit_damping import ImplicitDamping
 from raytac.world.mujoco_kernels import (
     Memory,
     correct_lifts,
@@ -48,7 +51,8 @@ class MujocoRows:
         """
         num_envs, pads = contact.wrenches.shape
         state, one = checked_layouts()
-        self._contact, self._blank = contact, _blank()
+        assert contact.views is not None  # they are on the CPU
+        self._views, self._blank, self._damping = contact.views, _blank(), ImplicitDamping(model)
         self._address, self._sparse = np.zeros(num_envs, np.uint64), np.zeros(1, np.int32)
         self._datas: list[mujoco.MjData] = []
         self._models: list[mujoco.MjModel] = []
@@ -69,12 +73,22 @@ class MujocoRows:
         roots, last = model.body_rootid[bodies], np.array([_last_dof(model, body) for body in bodies.tolist()])
         indices = [_array(values) for values in (sites, bodies, roots, last, model.dof_parentid)]
         gels, others = _array(geoms[len(geoms) - pads :]), _array(geoms)
-        self._read = Launch(read_frames, (len(bodies),), [memory, steps, *indices, contact.frames])
-        self._write = Launch(write_contacts, (), [memory, steps, slots, gels, others])
-        self._regularise = Launch(write_regularisation, (), [memory, steps, slots])
-        self._refer = Launch(write_references, (), [memory, steps, slots, _array(hard)])
-        self._correct = Launch(correct_lifts, (), [memory, steps, slots])
-        self._forces = Launch(read_constraint, (), [memory, slots, steps, contact.force, contact.velocity])
+        launch = partial(wp.launch, device="cpu")
+        frames = [memory, steps, *indices, contact.frames]
+        read = partial(launch, read_frames, dim=(num_envs, len(bodies)), inputs=frames)
+        forces = [memory, slots, steps, contact.force, contact.velocity]
+        self._begin = [Recorded(read, partial(contact.begin, whole=whole)) for whole in (False, True)]
+        self._move = Recorded(read, contact.move)
+        self._end = Recorded(partial(launch, read_constraint, dim=num_envs, inputs=forces), contact.end)
+        self._write, self._regularise, self._refer, self._correct = (
+            Recorded(partial(launch, kernel, dim=num_envs, inputs=[memory, steps, slots, *more]))
+            for kernel, more in (
+                (write_contacts, [gels, others]),
+                (write_regularisation, []),
+                (write_references, [_array(hard)]),
+                (correct_lifts, []),
+            )
+        )
 
     def bind(self, models: Sequence[mujoco.MjModel], datas: Sequence[mujoco.MjData]) -> None:
         """Name the states, and their models, that the next calls work on."""
@@ -97,17 +111,27 @@ class MujocoRows:
             mujoco.mj_fwdActuation(self._models[b], self._datas[b])
             mujoco.mj_fwdAcceleration(self._models[b], self._datas[b])
 
-    def read_frames(self, count: int) -> None:
-        """Frames of pads and bodies of the environments of this step."""
-        self._read(count)
+    def choose(self, envs: np.ndarray, done: np.ndarray | int) -> None:
+        """Name the environments of this step, which have done these ticks of the scene's."""
+        views, count = self._views, len(envs)
+        views.envs[:count], views.envs[count:] = envs, -1
+        views.done[:count] = done
 
-    def put(self, envs: Sequence[int]) -> None:
+    def begin(self, *, whole: bool = False) -> None:
+        """``GelContact.begin`` with the present frames, after ``choose`` and ``accelerate``."""
+        self._begin[whole]()
+
+    def move(self) -> None:
+        """``GelContact.move`` with the present frames, after ``choose``."""
+        self._move()
+
+    def put(self, envs: Sequence[int], *, own_step: bool) -> None:
         """Put the contacts that ``GelContact.begin`` found after MuJoCo's own.
 
-        An environment whose memory for contacts is full is lost.
+        An environment whose memory for contacts is full is lost. ``own_step``: ``second_half`` follows, not somebody else's ``mj_step2``.
         """
-        count, blank, views = len(envs), self._blank, self._contact.views
-        assert views is not None
+        self._damping.clear()
+        count, blank, views = len(envs), self._blank, self._views
         lost, rows = views.lost[:count].tolist(), []
         for i, number in enumerate(views.contacts[:count].tolist()):
             if not number or lost[i]:
@@ -118,18 +142,20 @@ class MujocoRows:
                     views.lost[i] = 1
                     break
             else:
+                if own_step and self._damping.matters:
+                    self._damping.add(envs[i], model, data, float(views.length[i]))
                 rows.append((model, data))
         if rows:
-            self._write(count)
+            self._write()
             for model, data in rows:
                 # The contacts come after MuJoCo's own collision, so what it has built on those is built again.
                 mujoco.mj_makeConstraint(model, data)
-            self._regularise(count)
+            self._regularise()
             for model, data in rows:
                 mujoco.mj_island(model, data)
                 mujoco.mj_projectConstraint(model, data)
                 mujoco.mj_referenceConstraint(model, data)
-        self._refer(count)
+        self._refer()
         self._foresee_slides(envs, views.slides[:count], views.lost[:count])
 
     def _foresee_slides(self, envs: Sequence[int], slides: np.ndarray, lost: np.ndarray) -> None:
@@ -140,19 +166,20 @@ class MujocoRows:
                 return
             for i in some:
                 mujoco.mj_fwdConstraint(self._models[envs[i]], self._datas[envs[i]])
-            self._correct(len(envs))
+            self._correct()
 
     def second_half(self, envs: Sequence[int], lengths: Sequence[float], timestep: float) -> None:
         """``mj_step2`` of the length [s] of each environment's step; afterwards the models have ``timestep`` again."""
         models, datas, options = self._models, self._datas, self._options
         for b, length in zip(envs, lengths, strict=True):
             options[b].timestep = length
-            mujoco.mj_step2(models[b], datas[b])
+            if not self._damping.step(b, models[b], datas[b]):
+                mujoco.mj_step2(models[b], datas[b])
             options[b].timestep = timestep
 
-    def read_forces(self, count: int) -> None:
-        """Forces and velocities of the rows at the end of the step; environments that broke down are lost."""
-        self._forces(count)
+    def end(self) -> None:
+        """``GelContact.end`` with the forces and velocities of the rows; environments that broke down are lost."""
+        self._end()
 
 
 _SOLVES = 5

@@ -134,19 +134,19 @@ class RigidPads:
 
         So are those in which a body goes through a pad all the same.
         """
-        scene, contact = self.composed, self._contact
+        scene, ticks = self.composed, self._contact.ticks
         self._bind(datas)
         self._views.before[:] = np.nan
-        for _ in range(round(scene.control_timestep / scene.timestep)):
-            done = np.zeros(len(datas), int)
-            while len(envs := np.flatnonzero(~failed & (done < contact.ticks))):
-                done[envs] += self._step(envs, drive, done[envs], failed)
+        # No environment waits for those that take shorter steps.
+        total, done = ticks * round(scene.control_timestep / scene.timestep), np.zeros(len(datas), int)
+        while len(envs := np.flatnonzero(~failed & (done < total))):
+            done[envs] += self._step(envs, drive, done[envs] % ticks, failed)
         sound = np.flatnonzero(~failed)
         for b in sound.tolist():
             mujoco.mj_kinematics(self._models[b], datas[b])  # so that poses are those of the end of the step
         if len(sound):
-            self._read_frames(sound, 0)
-            contact.move(len(sound))
+            self._mujoco.choose(sound, 0)
+            self._mujoco.move()
             self._mark_pierced(sound)
             self._mark_lost(sound, failed)
 
@@ -184,18 +184,13 @@ class RigidPads:
     def _bind(self, datas: Sequence[mujoco.MjData]) -> None:
         self._mujoco.bind([self._models[b] for b in range(len(datas))], datas)
 
-    def _read_frames(self, envs: np.ndarray, done: np.ndarray | int) -> None:
-        """Frames of environments that have done these ticks of the scene's step."""
-        self._views.envs[: len(envs)], self._views.done[: len(envs)] = envs, done
-        self._mujoco.read_frames(len(envs))
-
     def _insert(self, envs: np.ndarray, done: np.ndarray | int, *, whole: bool = False) -> None:
         """Put the pads' contacts among MuJoCo's, after ``mj_step1`` and with the controls of the step; ``whole``: it is not divided."""
         self._mujoco.accelerate(envs.tolist())
-        self._read_frames(envs, done)
-        self._contact.begin(len(envs), whole=whole)
+        self._mujoco.choose(envs, done)
+        self._mujoco.begin(whole=whole)
         self._mark_pierced(envs)
-        self._mujoco.put(envs.tolist())
+        self._mujoco.put(envs.tolist(), own_step=not whole)
 
     def _mark_pierced(self, envs: np.ndarray) -> None:
         """Mark environments as lost in which a body is beyond a bonded face, or was on its path since the last step."""
@@ -207,8 +202,7 @@ class RigidPads:
 
     def _finish(self, envs: np.ndarray, failed: np.ndarray) -> None:
         """Read forces, and let the gels shear by what bodies moved in the step."""
-        self._mujoco.read_forces(len(envs))
-        self._contact.end(len(envs))
+        self._mujoco.end()
         self._mark_lost(envs, failed)
 
     def _mark_lost(self, envs: np.ndarray, failed: np.ndarray) -> None:

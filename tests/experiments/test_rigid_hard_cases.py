@@ -32,8 +32,8 @@ def test_a_run_reports_every_check_and_goes_on_where_it_stopped(tmp_path: Path, 
     text = (tmp_path / "table.txt").read_text()
     assert "steps of 2 and 1 ms: greatest depth" in text and (tmp_path / "rigid_hard.png").stat().st_size > 10_000
     ran.clear()
-    hard.main(hard.Args(**options, cases="drop_5g_1ms-1_1ms,grasps_sphere"))
-    assert ran == ["grasps_sphere"]
+    hard.main(hard.Args(**options, cases="drop_5g_1ms-1_1ms,grasps_sphere_0"))
+    assert ran == ["grasps_sphere_0"]
     with pytest.raises(InputError, match="other settings"):
         hard.main(hard.Args(**{**options, "seconds": 0.03}, cases="pin*"))
 
@@ -92,10 +92,24 @@ def test_drops_begin_at_one_height_whatever_the_step() -> None:
     assert begun[0] == begun[1]
 
 
+def test_steps_are_compared_within_one_speed() -> None:
+    """The speed of a drop reads like a step: 2ms-1."""
+
+    def row(name: str, force: float) -> hard.Row:
+        return {"case": name, "curves": {"result_of": ["greatest force"], "result": [force]}}
+
+    speeds = (1.0, 2.0, 5.0)
+    rows = [row(f"drop_5g_{v:g}ms-1_{dt}ms", 10.0 * v + (0.1 if dt == 2 else 0.0)) for v in speeds for dt in (1, 2, 10)]
+    compared = hard.agreement(rows)
+    assert [one["case"] for one in compared] == [f"drop_5g_{v:g}ms-1_steps" for v in speeds]
+    assert [one["checks"][0]["value"] for one in compared] == pytest.approx([0.01 / v for v in speeds])
+
+
 def test_full_runs_have_every_combination() -> None:
     quick, full = hard.all_cases(hard.Args()), hard.all_cases(hard.Args(full=True))
     drops = [name for name in full if name.startswith("drop")]
     assert len(drops) == 3 * 6 * 5 and set(quick) <= set(full)
     assert {f"lift_mu{mu:g}_2ms" for mu in (0.1, 0.3, 1.0, 1.5)} <= set(full)
-    counts = [case.args[1] for name, case in full.items() if name.startswith("grasps")]  # type: ignore[attr-defined]
-    assert sum(counts) == 10_000 and np.ptp(counts) <= 1
+    counts = {name: case.args[1] for name, case in full.items() if name.startswith("grasps")}  # type: ignore[attr-defined]
+    shares = [sum(n for name, n in counts.items() if name.startswith(f"grasps_{thing}_")) for thing in hard.OBJECTS]
+    assert sum(counts.values()) == sum(shares) == 10_000 and np.ptp(shares) <= 1 and max(counts.values()) <= 128

@@ -331,3 +331,28 @@ def test_impossible_meshes_are_refused() -> None:
         mesh_part(corner, np.zeros((0, 3), int))
     with pytest.raises(InputError, match="B, 4, 4"):
         object_height([primitive("sphere", (1e-3,))], np.eye(4), X, Y)
+
+
+@pytest.mark.parametrize("kind", ["mesh", "relief"])
+def test_no_vertex_is_placed_of_a_surface_that_its_box_holds_away(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from raytac.shapes import underside
+
+    elevation = 1e-3 * np.random.default_rng(0).uniform(size=(9, 9))
+    part = body("mesh") if kind == "mesh" else relief_part(elevation, 3e-3)
+    placed: list[int] = []
+    candidates = underside._candidates
+    monkeypatch.setattr(underside, "_candidates", lambda *given: (placed.append(1), candidates(*given))[1])
+    for seed in range(20):
+        pose = random_pose(seed)
+        if kind == "relief" and looks_down(part, pose):
+            continue
+        assert part.vertices is not None
+        points = part.vertices @ pose[:3, :3].T + pose[:3, 3]
+        for axis, line in ((0, X), (1, Y)):
+            aside = pose.copy()
+            aside[axis, 3] += line[-1] - points[:, axis].min() + 6e-3
+            assert np.isinf(object_height([part], aside[None], X, Y)).all()
+        assert np.isinf(object_height([part], pose[None], X, Y, below=points[:, 2].min() - 6e-3)).all()
+        assert not placed
+        object_height([part], pose[None], X, Y, below=points[:, 2].min() + 1e-6)
+        assert placed.pop() and not placed

@@ -91,6 +91,24 @@ def sheared(displacement: np.ndarray, over_gel: np.ndarray, radius: float, slack
     return np.array(result)
 
 
+def test_a_stiffness_that_jitters_by_its_last_digits_leaves_the_stretch_as_it_is() -> None:
+    """A body at rest: what has shrunk by one digit grows again by one, or by less than its rings can tell."""
+    rng, count = np.random.default_rng(3), 400
+    rows = np.arange(count), np.zeros(count, int), np.zeros(count, int)
+    state, first = Sheared(count, 1, 1), STIFFNESS * rng.uniform(0.6, 1.0, count)
+    limit, centre, radius = np.full((count, 2), 1e9), np.zeros((count, 3)), np.full(count, RADIUS)  # no slip, even at the rim
+
+    def step(stiffness: np.ndarray, displacement: float) -> np.ndarray:
+        pull = state.begin(rows, np.stack([stiffness, stiffness * RADIUS**2], axis=1), centre)
+        state.move(rows, np.tile([displacement, 0.0, 0.0], (count, 1)), limit, centre, radius)
+        return pull
+
+    step(STIFFNESS * np.ones(count), 1e-4)
+    pulls = [step(first + k * np.spacing(first), 0.0) for k in (1, 0, 1, 0, 2, 1, 2)]
+    np.testing.assert_allclose(pulls, np.tile(pulls[0], (7, 1, 1)), rtol=1e-12)
+    np.testing.assert_allclose(pulls[0][:, 0], 1e-4 * first, rtol=1e-9)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_what_sticks_keeps_its_stretch_however_far_it_shears(share: float) -> None:
     """A pin sheared by more than twice its contact's radius, then held for 10 s of 1 ms steps while its centre jitters by a node's share.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -48,8 +48,8 @@ class Bodies:
 class GelContact:
     """Contacts of B environments with gels, on the CPU or on CUDA.
 
-    ``begin`` and ``end`` work on the first n rows of the arrays, the environments that ``rows`` names. Between both MuJoCo takes the step.
-    On CUDA nothing waits for the device, and the NumPy views are None.
+    ``begin`` and ``end`` work on the rows that ``steps.envs`` gives an environment. Between both MuJoCo takes the step. They only launch
+    kernels, always the same ones, so that they can be ``Recorded``. On CUDA the NumPy views are None.
 
     Attributes:
         ticks: parts of the scene's step, the length of the shortest one.
@@ -117,53 +117,51 @@ class GelContact:
         self.before.fill_(wp.mat44d(*[np.nan] * 16))
         self.shear = ShearState(*slots, device=device)
         self.views = _Views(self, count) if self.device.is_cpu else None
-        self._whole, self._clock = False, [float(timestep), self.ticks]
-        inputs = [self.frames, self.steps, self._gels, self._touched, self.before, *self._clock, float(case_travel)]
-        inputs += [self.motion, self.slots, self.search.poses, self.search.reach]
-        self._move = self._launch(move_bodies, (pads,), inputs)
-        self._choose = self._launch(choose_steps, (), [self.motion, self.slots, *self._clock, 0, self.steps])
-        given, outputs = (
-            [self.force, self.velocity, self.motion],
-            [self.shear.struct, self.rolling, self.acceleration, self.slots],
-        )
-        self._read = self._launch(read_rows, slots[1:], [*given, self.steps, self._touched, *outputs])
-        self._sum = self._launch(sum_wrenches, (pads,), [self.slots, self.steps, self._touched, self.wrenches])
-        self._bodies = _Results(self, self.search, 0, 0)
-        self._pairs = [
-            _Pair(
-                i,
-                j,
-                search,
-                self._launch(pair_of_gels, (), self._to_pair(search, i, count + j)),
-                _Results(self, search, i, count + j),
-            )
-            for i, j, search in pairs
-        ]
+        self._clock, self._case_travel = [float(timestep), self.ticks], float(case_travel)
+        self._pairs = [(search, i, count + j) for i, j, search in pairs]
+        self._searches = [*([(self.search, 0, 0)] if self.search.pairs else []), *self._pairs]
+        for search, _, _ in self._searches:
+            search.reserve(search.pairs)
 
-    def begin(self, count: int, *, whole: bool = False) -> None:
+    def begin(self, *, whole: bool = False) -> None:
         """Find contacts from ``frames``, choose the length of each environment's step, and set the rows of its contacts.
 
         ``whole``: of the scene's step, which is not divided.
         """
-        self.move(count)
-        some = self._search(count) if self.views is None else self._search_near(count, self.views)
-        for results in some:
-            results.approach(count)
-        if whole is not self._whole:
-            self._whole = whole
-            self._choose.set("whole", int(whole))
-        self._choose(count)
-        for results in some:
-            results.set_rows(count)
+        self.move()
+        for search, pad, body in self._pairs:
+            poses = [self.motion, self.steps, pad, body, *self._clock, search.poses, search.reach]
+            self._launch(pair_of_gels, (), poses)
+        shared = [self._numbers, self._gels, self._touched]
+        for search, *at in self._searches:
+            search.launch()
+            results = [search.rows, search.near, search.ends, *search.poses.shape[1:], *at]
+            self._launch(
+                approach,
+                search.poses.shape[1:],
+                [*results, self.motion, *shared, self.acceleration, *self._clock, self.steps, self.slots],
+            )
+        self._launch(choose_steps, (), [self.motion, self.slots, *self._clock, int(whole), self.steps])
+        for search, *at in self._searches:
+            results = [search.rows, *search.poses.shape[1:], *at, self.frames, self.motion]
+            self._launch(
+                set_rows,
+                search.poses.shape[1:],
+                [*results, *shared, self.rolling, self.steps, self.shear.struct, self.slots],
+            )
 
-    def move(self, count: int) -> None:
+    def move(self) -> None:
         """Motion of bodies alone, with what may have gone through a pad."""
-        self._move(count)
+        inputs = [self.frames, self.steps, self._gels, self._touched, self.before, *self._clock, self._case_travel]
+        self._launch(
+            move_bodies, (len(self._gels.thickness),), [*inputs, self.motion, self.slots, self.search.poses, self.search.reach]
+        )
 
-    def end(self, count: int) -> None:
+    def end(self) -> None:
         """Let the gels shear, and add up the wrenches, by ``force`` and ``velocity``."""
-        self._read(count)
-        self._sum(count)
+        inputs = [self.force, self.velocity, self.motion, self.steps, self._touched]
+        self._launch(read_rows, self.force.shape[1:3], [*inputs, self.shear.struct, self.rolling, self.acceleration, self.slots])
+        self._launch(sum_wrenches, self.wrenches.shape[1:], [self.slots, self.steps, self._touched, self.wrenches])
 
     def clear(self, envs: np.ndarray) -> None:
         """Forget what environments went through, on the CPU."""
@@ -172,52 +170,9 @@ class GelContact:
         self.views.wrench[envs] = self.views.acceleration[envs] = self.views.rolling[envs] = 0.0
         self.views.before[envs] = np.nan
 
-    def results_inputs(self, search: PadSearch, pad: int, body: int) -> tuple[list[Any], list[Any]]:
-        """Inputs of ``approach`` and of ``set_rows`` on the results of a search, whose pads and bodies begin with these."""
-        places = [*search.poses.shape[1:], pad, body]
-        shared = [self._numbers, self._gels, self._touched]
-        to_approach = [search.rows, search.near, search.ends, *places, self.motion, *shared, self.acceleration, *self._clock]
-        to_set = [
-            search.rows,
-            *places,
-            self.frames,
-            self.motion,
-            *shared,
-            self.rolling,
-            self.steps,
-            self.shear.struct,
-            self.slots,
-        ]
-        return [*to_approach, self.steps, self.slots], to_set
-
-    def _search(self, count: int) -> list[_Results]:
-        """All searches, which does not need the host."""
-        some = []
-        if 0 not in self.search.poses.shape:
-            self.search.launch()
-            some.append(self._bodies)
-        for pair in self._pairs:
-            pair.pose(count)
-            pair.search.launch()
-            some.append(pair.results)
-        return some
-
-    def _search_near(self, count: int, views: _Views) -> list[_Results]:
-        """Searches of what is near; those that have results."""
-        some = [self._bodies] if self.search.run(count) else []
-        if self._pairs and np.count_nonzero(views.near_gel[:count]):
-            for pair in self._pairs:
-                if views.near_gel[:count, pair.first, pair.second].any():
-                    pair.pose(count)
-                    if pair.search.run(count):
-                        some.append(pair.results)
-        return some
-
-    def _to_pair(self, search: PadSearch, pad: int, body: int) -> list[Any]:
-        return [self.motion, self.steps, pad, body, *self._clock, search.poses, search.reach]
-
-    def _launch(self, kernel: Any, rest: tuple[int, ...], inputs: Sequence[Any]) -> Launch:
-        return Launch(kernel, rest, inputs, self.device)
+    def _launch(self, kernel: Any, rest: tuple[int, ...], inputs: Sequence[Any]) -> None:
+        """``rest``: threads along the axes after that of environments."""
+        wp.launch(kernel, dim=(len(self.steps.envs), *rest), inputs=list(inputs), device=self.device)
 
     def _zeros(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self.device)
@@ -241,7 +196,6 @@ class _Views:
         self.contacts: np.ndarray = contact.steps.contacts.numpy()
         self.slides: np.ndarray = contact.steps.slides.numpy()
         self.suspect: np.ndarray = contact.motion.suspect.numpy()
-        self.near_gel: np.ndarray = contact.motion.near_gel.numpy()
         self.poses: np.ndarray = contact.motion.pose.numpy()[:, :, :bodies]
         """``pad_from_body`` of bodies."""
         self.poses_before: np.ndarray = contact.motion.before.numpy()
@@ -249,55 +203,6 @@ class _Views:
         self.wrench: np.ndarray = contact.wrenches.numpy()
         self.acceleration: np.ndarray = contact.acceleration.numpy()
         self.rolling: np.ndarray = contact.rolling.numpy()
-
-
-class Launch:
-    """Launch of a kernel for a number of environments, recorded: repeating it costs a tenth."""
-
-    def __init__(self, kernel: Any, rest: tuple[int, ...], inputs: Sequence[Any], device: Any = "cpu") -> None:
-        """``rest``: threads along the axes after that of environments."""
-        self._rest, self._count = rest, 1
-        self._launch: Any = wp.launch(kernel, dim=(1, *rest), inputs=list(inputs), device=device, record_cmd=True)
-
-    def __call__(self, count: int) -> None:
-        if count != self._count:
-            self._launch.set_dim((count, *self._rest))
-            self._count = count
-        self._launch.launch()
-
-    def set(self, name: str, value: Any) -> None:
-        """Give another value to a parameter."""
-        self._launch.set_param_by_name(name, value)
-
-
-class _Results:
-    """Launches on the results of one search, recorded again when the search has made more memory."""
-
-    def __init__(self, contact: GelContact, search: PadSearch, pad: int, body: int) -> None:
-        self._contact, self._search, self._at = contact, search, (pad, body)
-        self._rows: Any = None
-
-    def approach(self, count: int) -> None:
-        if self._rows is not self._search.rows:
-            self._rows = self._search.rows
-            to_approach, to_set = self._contact.results_inputs(self._search, *self._at)
-            dim, device = self._search.poses.shape[1:], self._contact.device
-            self._approach, self._set = Launch(approach, dim, to_approach, device), Launch(set_rows, dim, to_set, device)
-        self._approach(count)
-
-    def set_rows(self, count: int) -> None:
-        self._set(count)
-
-
-class _Pair(NamedTuple):
-    """Two gels that may touch: the second is a body for the first."""
-
-    first: int
-    second: int
-    search: PadSearch
-    pose: Launch
-    """Gives the search its poses and reach."""
-    results: _Results
 
 
 def _gels(gels: Sequence[GelpadSpec], bodies: Bodies, device: Any) -> Any:

@@ -161,6 +161,13 @@ def move_bodies(
     """
     row, pad = wp.tid()
     pads, bodies, env = frames.place.shape[1] - touched.bodies, touched.bodies, steps.envs[row]
+    if pad == 0:
+        steps.lost[row] = wp.where(env < 0, 1, 0)
+    if env < 0:
+        for body in range(bodies):
+            poses[row, pad, body] = wp.mat44d()
+        reach[row, pad] = -_INF
+        return
     origin, back = frames.place[row, pad], wp.transpose(frames.turn[row, pad])
     pad_velocity, pad_spin = frames.velocity[row, pad], frames.spin[row, pad]
     motion.world_from_pad[row, pad] = pose_of(frames.turn[row, pad], origin)
@@ -217,8 +224,6 @@ def move_bodies(
             motion.near_gel[row, pad, other] = near
     motion.case_step[row, pad] = case_step
     reach[row, pad] = wp.where(bodies > 0, fastest * left + quickest * left * left, _0)
-    if pad == 0:
-        steps.lost[row] = 0
 
 
 @wp.kernel
@@ -233,8 +238,12 @@ def pair_of_gels(
     poses: wp.array3d(dtype=wp.mat44d),
     reach: wp.array2d(dtype=wp.float64),
 ):
-    """Poses and reach of the search for another gel, which is ``body``."""
+    """Poses and reach of the search for another gel, which is ``body``; a reach of −inf where it is not near."""
     row = wp.tid()
+    if steps.envs[row] < 0 or motion.near_gel[row, pad, body - (motion.pose.shape[2] - motion.near_gel.shape[2])] == 0:
+        poses[row, 0, 0] = wp.mat44d()
+        reach[row, 0] = -_INF
+        return
     left = timestep * (_1 - wp.float64(steps.done[row]) / wp.float64(scene_ticks))
     poses[row, 0, 0] = motion.pose[row, pad, body]
     reach[row, 0] = (wp.length(motion.velocity[row, pad, body]) + motion.push[row, pad, body] * left) * left

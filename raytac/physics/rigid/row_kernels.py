@@ -304,6 +304,8 @@ def read_rows(
 def sum_wrenches(slots: Slots, steps: Steps, touched: Touched, wrench: wp.array2d(dtype=wp.spatial_vectord)):
     """Wrench on each pad, (B, pads), in the order of the slots; 0 in an environment that is lost."""
     i, pad = wp.tid()
+    if steps.envs[i] < 0:
+        return
     total = wp.spatial_vectord()
     for body in range(slots.held.shape[2]):
         total += slots.wrench[i, pad, body]

@@ -64,7 +64,7 @@ class PadSearch:
         self._work = self._memory(num_envs)
         self._work.ahead = ahead
         self._allocate(num_envs)
-        self.reserve(self._pairs if self.device.is_cuda else 1)
+        self.reserve(self.pairs if self.device.is_cuda else 1)
 
     def contacts(self, pad_from_body: np.ndarray, envs: np.ndarray, reach: np.ndarray | float) -> PadContacts:
         """Contacts and gaps of environments.
@@ -122,7 +122,7 @@ class PadSearch:
         """
         self._find_near(self.poses.shape[0])
         wp.utils.array_scan(self.near, self.ends, inclusive=True)
-        self._measure(self._pairs)
+        self._measure(self.pairs)
 
     def reserve(self, rows: int) -> None:
         """Make memory for so many rows."""
@@ -138,11 +138,11 @@ class PadSearch:
 
     def _allocate(self, num_envs: int) -> None:
         pads, bodies = self._shape
-        self._pairs = num_envs * pads * bodies
+        self.pairs = num_envs * pads * bodies
         self.poses = wp.zeros((num_envs, pads, bodies), dtype=wp.mat44d, device=self.device)
         self.reach = wp.zeros((num_envs, pads), dtype=wp.float64, device=self.device)
-        self.near = wp.zeros(self._pairs, dtype=wp.int32, device=self.device)
-        self.ends = wp.zeros(self._pairs, dtype=wp.int32, device=self.device)
+        self.near = wp.zeros(self.pairs, dtype=wp.int32, device=self.device)
+        self.ends = wp.zeros(self.pairs, dtype=wp.int32, device=self.device)
         if self._capacity:
             self._record()
 
@@ -177,7 +177,7 @@ class PadSearch:
             measure,
             dim=[self._blocks],
             inputs=[
-                self.poses, self.reach, shapes, pads, self.near, self.ends, self._blocks, self._pairs, self._work, self.rows,
+                self.poses, self.reach, shapes, pads, self.near, self.ends, self._blocks, self.pairs, self._work, self.rows,
             ],
             device=self.device,
             block_dim=_LANES,

@@ -1,7 +1,8 @@
 """Arrays that the kernels of a world's pads share: gels, bodies, differences of environments, and slots of environment, pad and body.
 
 A slot's body is one of the ``bodies`` that pads touch, or another pad's gel: gel k is body ``bodies`` + k. The kernels work on n rows, the
-environments of this step, in the order of ``envs``; what lasts from step to step has one entry for each of all B environments.
+environments of this step, in the order of ``envs``, and skip the rows after these. What lasts from step to step has one entry for each of
+all B environments.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -146,7 +147,7 @@ class Steps:
     """One step of n environments, each of its own length."""
 
     envs: wp.array(dtype=wp.int32)
-    """Indices among all B."""
+    """Indices among all B; −1 in rows that this step is without."""
     done: wp.array(dtype=wp.int32)
     """Ticks of the scene's step that are done."""
     ticks: wp.array(dtype=wp.int32)
@@ -154,7 +155,7 @@ class Steps:
     length: wp.array(dtype=wp.float64)
     """Δt [s]."""
     lost: wp.array(dtype=wp.int32)
-    """1 where physics broke down."""
+    """1 where physics broke down, and in rows without an environment."""
     contacts: wp.array(dtype=wp.int32)
     """Contacts of gels that are held."""
     slides: wp.array(dtype=wp.int32)

@@ -158,7 +158,7 @@ class _Parts:
 
     def grow(self, stiffness: float, twist: float) -> None:
         k, old, size = int(self.size), self.size, stiffness / self.width
-        if old > k:
+        if size > old > k:
             first, second = self.stretch[k]
             scale = np.array([1.0, 1.0, twist])
             if scale @ second**2 >= 0.01 * (scale @ first**2):

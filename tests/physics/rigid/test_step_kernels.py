@@ -11,6 +11,7 @@ import warp as wp
 
 from raytac.physics.rigid.contacts import LoadTables, PadContacts
 from raytac.physics.rigid.gel_contact import Bodies, GelContact
+from raytac.physics.rigid.recorded import Recorded
 from raytac.physics.rigid.shear import LEAST_RINGS, MOST_RINGS
 from raytac.se3 import rotations
 from raytac.shapes.part import primitive
@@ -154,8 +155,8 @@ class Step:
         self.case_step = beside.min(axis=2)
         poses = contact.motion.pose.numpy()
         some = [contact.search.contacts(poses[:, :, :COUNT], envs, contact.search.reach.numpy().copy())]
-        i, j, search, *_ = contact._pairs[0]
-        near = search.contacts(poses[:, i : i + 1, COUNT + j : COUNT + j + 1], envs, search.reach.numpy().copy())
+        (search, i, body), j = contact._pairs[0], contact._pairs[0][2] - COUNT
+        near = search.contacts(poses[:, i : i + 1, body : body + 1], envs, np.maximum(search.reach.numpy(), 0.0))
         some.append(replace(near, pad=near.pad + i, body=near.body + COUNT + j, clearance=near.clearance + GELS[j].thickness))
         rows = {name: np.concatenate([getattr(one, name) for one in some]) for name in PadContacts.__dataclass_fields__}
         contacts = chosen(PadContacts(**rows), np.lexsort((rows["body"], rows["pad"], rows["env"])))
@@ -301,7 +302,7 @@ def same(actual: np.ndarray, expected: np.ndarray, tolerance: float = 1e-12) -> 
 def test_a_step_of_the_kernels_is_that_of_numpy(seed: int) -> None:
     state = random_state(seed)
     contact = gel_contact(state)
-    contact.begin(ENVS)
+    contact.begin()
     slots = {name: of_slots(contact, name).copy() for name in ("row", "held", "speed", "longest", "centre", "radius")}
     slots |= {name: of_slots(contact, name).copy() for name in ("place", "frame", "friction", "force", "regularisation")}
     step = Step(state, contact)
@@ -346,7 +347,7 @@ def test_a_step_of_the_kernels_is_that_of_numpy(seed: int) -> None:
     velocity[step.slot] = rng.normal(0.0, 0.1, (len(step.held), 6))
     contact.force.assign(force)
     contact.velocity.assign(velocity)
-    contact.end(ENVS)
+    contact.end()
     wrench = step.end(force[step.slot], velocity[step.slot])
     same(contact.views.wrench[~step.lost], wrench[~step.lost], 1e-10)
     for name, values in vars(step.shear).items():
@@ -389,14 +390,14 @@ def taken(state: State, envs: np.ndarray) -> State:
     return State(**{name: of(values) for name, values in vars(state).items()})
 
 
-def results(contact: GelContact, num_envs: int) -> dict[str, np.ndarray]:
+def results(contact: GelContact) -> dict[str, np.ndarray]:
     """Everything that a step leaves, with forces that depend on the slot alone."""
-    contact.begin(num_envs)
+    contact.begin()
     shape = contact.force.shape
     values = np.cos(np.arange(np.prod(shape[1:]))).reshape(shape[1:])
     contact.force.assign(np.broadcast_to(1.0 + values, shape))
     contact.velocity.assign(np.broadcast_to(0.1 * values, shape))
-    contact.end(num_envs)
+    contact.end()
     held = of_slots(contact, "held").astype(bool)
     result = {name: of_slots(contact, name) * held[..., None] for name in ("place", "friction", "force", "regularisation")}
     names = "stretch", "inner", "width", "mean", "stiffness", "load", "play"
@@ -411,30 +412,56 @@ def results(contact: GelContact, num_envs: int) -> dict[str, np.ndarray]:
 
 def test_a_batch_is_its_environments_alone_to_the_bit() -> None:
     state = random_state(7, 12)
-    whole = results(gel_contact(state), 12)
+    whole = results(gel_contact(state))
     for b in (0, 5, 11):
-        alone = results(gel_contact(taken(state, np.array([b]))), 1)
+        alone = results(gel_contact(taken(state, np.array([b]))))
         for name, values in alone.items():
             np.testing.assert_array_equal(values[0], whole[name][b], err_msg=name)
 
 
-def test_the_route_that_needs_no_host_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on CUDA: every search is launched, whatever is near."""
+def test_rows_without_an_environment_are_left_out() -> None:
+    """Whatever they held before: neither they nor the environments that had them change."""
     state = random_state(8)
-    one, contact = results(gel_contact(state), ENVS), gel_contact(state)
-    for search in (contact.search, contact._pairs[0].search):
-        search.reserve(ENVS * PADS * COUNT)
-    monkeypatch.setattr(contact, "_search_near", lambda count, views: contact._search(count))
-    other = results(contact, ENVS)
-    for name, values in one.items():
-        np.testing.assert_array_equal(other[name], values, err_msg=name)
+    whole, contact, count = results(gel_contact(state)), gel_contact(state), ENVS - 3
+    contact.slots.row.fill_(0)
+    contact.slots.held.fill_(1)
+    contact.motion.near_gel.fill_(1)
+    contact.search.poses.fill_(wp.mat44d(*[np.nan] * 16))
+    contact.steps.envs.assign(np.where(np.arange(ENVS) < count, np.arange(ENVS), -1).astype(np.int32))
+    some = results(contact)
+    for name, values in whole.items():
+        np.testing.assert_array_equal(some[name][:count], values[:count], err_msg=name)
+    for name in ("stretch", "stiffness", "load", "play"):
+        np.testing.assert_array_equal(some[name][count:], state.shear[name][count:], err_msg=name)
+    np.testing.assert_array_equal(some["rolling"][count:], state.rolling[count:])
+    assert not some["wrench"][count:].any() and whole["wrench"][count:].any()
+    assert np.isnan(contact.before.numpy()[count:]).all()
+
+
+def test_kernels_that_are_recorded_do_the_same_on_every_repeat() -> None:
+    state = random_state(9)
+    plain, contact = gel_contact(state), gel_contact(state)
+    begin, end = Recorded(contact.begin), Recorded(contact.end)
+    assert not of_slots(contact, "held").any()  # recording runs nothing
+    for _ in range(2):
+        plain.begin()
+        begin()
+        for one in (plain, contact):
+            one.force.fill_(0.5)
+            one.velocity.fill_(0.01)
+        plain.end()
+        end()
+        assert of_slots(plain, "held").any()
+        for name in ("held", "place", "force", "wrench"):
+            np.testing.assert_array_equal(of_slots(contact, name), of_slots(plain, name), err_msg=name)
+        np.testing.assert_array_equal(contact.wrenches.numpy(), plain.wrenches.numpy())
 
 
 @pytest.mark.gpu
 def test_cuda_gives_what_the_cpu_gives() -> None:
     wp.init()
     state = random_state(8)
-    one, other = results(gel_contact(state), ENVS), results(gel_contact(state, "cuda"), ENVS)
+    one, other = results(gel_contact(state)), results(gel_contact(state, "cuda"))
     np.testing.assert_array_equal(one["held"], other["held"])
     # A node on an edge between two triangles may see either, so that a mesh is now and then measured on another grid.
     off = np.zeros(one["held"].shape, bool)
@@ -456,7 +483,7 @@ def test_what_a_bonded_face_refuses_is_suspected() -> None:
     contact, faces = gel_contact(state), BondedFaces(GELS, SHAPES)
     views = contact.views
     assert views is not None
-    contact.move(60)
+    contact.move()
     poses = views.poses.copy()
     pierced = faces.pierced(poses)
     assert pierced.sum() > 20 and not (pierced & (views.suspect == 0)).any()
@@ -470,7 +497,7 @@ def test_what_a_bonded_face_refuses_is_suspected() -> None:
     above = np.tile(np.eye(4), (3, PADS, COUNT, 1, 1))
     above[..., 2, 3] = 0.05
     views.before[:] = above
-    contact.move(3)
+    contact.move()
     some = views.suspect != 0
     np.testing.assert_array_equal(views.poses_before, above)
     np.testing.assert_array_equal(views.before, views.poses)

@@ -1,0 +1,82 @@
+"""Steps in which the forces of contacts know of the damping that MuJoCo's integrator takes at the end of a step.
+
+MuJoCo solves for the forces of constraints with the mass matrix M, as if velocities changed by Δt M⁻¹ f. Its integrator then divides by
+M + Δt D with D the damping of joints, tendons and servos. Where Δt D is not small against M, as at a finger of 50 g on a servo with
+100 N s/m, the velocity that a contact counts on does not come: the finger is many times heavier for the contact than it is. With M + Δt D
+in both, forces and velocities at the end of a step fit each other.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+_MATTERS = 0.1
+"""Least share of Δt D in M, on the diagonal, that counts."""
+
+
+class ImplicitDamping:
+    """Steps of environments of one model; models may differ in all but damping.
+
+    Attributes:
+        matters: whether there is damping that a step of the model's timestep does not resolve. If not, steps are MuJoCo's own.
+    """
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self._is_euler = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+        self._diagonal = model.M_rowadr + model.M_rownnz - 1
+        self._of_joints = np.zeros_like(model.dof_damping)
+        if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
+            self._of_joints = model.dof_damping.copy()
+        self._of_mass = model.mapD2M
+        self._mass: dict[int, np.ndarray] = {}
+        self._scratch = start = mujoco.MjData(model)
+        mujoco.mj_forward(model, start)
+        mass = start.M[self._diagonal].copy()
+        damping = self._damping(model, start)[self._diagonal]
+        self.matters = bool((model.opt.timestep * damping > _MATTERS * mass).any())
+
+    def clear(self) -> None:
+        """Forget environments that were not stepped."""
+        self._mass.clear()
+
+    def add(self, env: int, model: mujoco.MjModel, data: mujoco.MjData, step: float) -> None:
+        """Add the damping of a step [s] to the mass matrix, after ``mj_step1`` and before constraints are made.
+
+        The damping is that of the last step: only how much of it is implicit depends on that.
+        """
+        self._mass[env] = data.M.copy()
+        data.M[:] += step * self._damping(model, data)
+        mujoco.mj_factorM(model, data)
+        mujoco.mj_fwdAcceleration(model, data)
+
+    def step(self, env: int, model: mujoco.MjModel, data: mujoco.MjData) -> bool:
+        """``mj_step2`` of an environment whose damping was added, which has its own mass matrix after it; False of another one."""
+        mass = self._mass.pop(env, None)
+        if mass is None:
+            return False
+        mujoco.mj_fwdActuation(model, data)
+        mujoco.mj_fwdAcceleration(model, data)
+        mujoco.mj_fwdConstraint(model, data)
+        mujoco.mj_sensorAcc(model, data)
+        mujoco.mj_checkAcc(model, data)
+        data.M[:] = mass
+        mujoco.mj_factorM(model, data)
+        if self._is_euler:
+            mujoco.mj_Euler(model, data)
+        else:
+            mujoco.mj_implicit(model, data)
+        return True
+
+    def _damping(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+        """D in the order of the mass matrix's entries [N s/m, N m s]."""
+        if self._is_euler:
+            result = np.zeros_like(data.M)
+            result[self._diagonal] = self._of_joints
+            return result
+        if not data.qDeriv.any():  # no step so far
+            if data is not self._scratch:
+                mujoco.mj_copyData(self._scratch, model, data)
+            mujoco.mj_implicit(model, self._scratch)
+            data.qDeriv[:] = self._scratch.qDeriv
+        return -data.qDeriv[self._of_mass]
