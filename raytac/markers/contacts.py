@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from operator import add
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -317,17 +317,27 @@ def _slipped(moved: tuple[float, float, float], contact: _Contact, slip: float) 
     """Shear and twist that a contact keeps: the closest point, in elastic energy, of the ellipsoid of sticking."""
     radius = max(contact.xx * contact.yy - contact.xy**2, 1e-24) ** 0.25
     shear_max, twist_max = slip * contact.depth * radius, TWIST_SLIP * slip * contact.depth
-    x0, y0 = math.hypot(*moved[:2]) / max(shear_max, 1e-12), abs(moved[2]) / max(twist_max, 1e-12)
-    if x0 * x0 + y0 * y0 <= 1.0:
+    x, y = math.hypot(*moved[:2]) / max(shear_max, 1e-12), abs(moved[2]) / max(twist_max, 1e-12)
+    if x * x + y * y <= 1.0:
         return moved
-    ratio = 1 / TWIST_SLIP**2
-    gamma = max(x0 - 1, (y0 - 1) / ratio, 0.0)
-    for _ in range(_LIMIT_STEPS):
-        p, q = 1 + gamma, 1 + ratio * gamma
-        x2, y2 = (x0 / p) ** 2, (y0 / q) ** 2
-        n = math.sqrt(x2 + y2)
-        gamma += n * n * max(n - 1, 0.0) / max(x2 / p + ratio * y2 / q, 1e-12)
-    return moved[0] / (1 + gamma), moved[1] / (1 + gamma), moved[2] / (1 + ratio * gamma)
+    sheared, turned = kept_shares(x, y, _LIMIT_STEPS, math.sqrt, max)
+    return sheared * moved[0], sheared * moved[1], turned * moved[2]
+
+
+def kept_shares(x: Any, y: Any, steps: int, sqrt: Callable[[Any], Any], larger: Callable[[Any, Any], Any]) -> tuple[Any, Any]:
+    """Shares of a shear and of a twist that stick, by both over their limits: those of the closest point of the ellipsoid, in energy.
+
+    Newton's method on 1 / √(x² + y²) = 1, which is a straight line in γ for b = 1, from where the larger of the two alone would be; b as
+    in ``fots``. ``sqrt`` and ``larger``: of the numbers, which may be arrays.
+    """
+    b = 1 / TWIST_SLIP**2
+    gamma = larger(larger(x - 1, (y - 1) / b), 0)
+    for _ in range(steps):
+        p, q = 1 + gamma, 1 + b * gamma
+        xp, yq = x / p, y / q
+        n = sqrt(xp * xp + yq * yq)
+        gamma = gamma + n * n * larger(n - 1, 0) / larger(xp * xp / p + b * yq * yq / q, 1e-12)
+    return 1 / (1 + gamma), 1 / (1 + b * gamma)
 
 
 def _motion(before: _Pose | None, now: _Pose | None) -> tuple[float, ...]:

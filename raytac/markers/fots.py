@@ -16,15 +16,16 @@ With ``MarkerMotionSpec.punch`` shear and twist are those around a disc that sti
 and 3.9; Reissner and Sagoci 1944), which fade with the pad's finite thickness. With x = M − G_c, x̂ its direction, A the disc's radius,
 r ≥ A its distance from G_c (``_beyond_ellipse`` has both for an ellipse), t = A / r and g(t) = t √(1 − t²):
 
-    shear    Δd_s = (2/π) F [(asin t − κ g) Δs + 2 κ g x̂ (x̂ · Δs)]      e_c = (2/π) F asin t      F = exp(−(r − A) / ℓ)
+    shear    Δd_s = (2/π) [(F asin t − κ g) Δs + 2 κ g x̂ (x̂ · Δs)]      e_c = (2/π) F asin t      F = exp(−(r − A) / ℓ)
     twist    Δd_t = (2/π) (asin t − g) (R(Δθ) − 1) x                   e_c = (2/π) (asin t − g)
 
-On a half-space of Poisson's ratio ν: κ = ν / (2 − ν) and ℓ = ∞. t = 1 under the contact, where both are the object's own motion. A contact
-of mean indentation h̄ sticks up to Δs_max = c h̄ A, or up to Δθ_max = ``TWIST_SLIP`` c h̄. This is Coulomb's law: the force
-8 G A Δs / (2 − ν) reaches μ P, with P = K h̄ π A² of a layer of foundation modulus K, so c = π μ K (2 − ν) / (8 G). Force F and couple M
-together stay on or within an ellipsoid, (F / F_max)² + (M / M_max)² = 1 (Howe and Cutkosky, Practical force-motion models for sliding
-manipulation, IJRR 15(6), 1996). Beyond it the contact slips along the ellipsoid's normal. F and M are linear in Δs and Δθ, so after slip
-these are
+On a half-space of Poisson's ratio ν: κ = ν / (2 − ν) and ℓ = ∞. A base near by ends the motion that is alike in all directions, F, but not
+the rest, by which the skin ahead of the contact goes with it and that beside it comes back. t = 1 under the contact, where both are the
+object's own motion. A contact of mean indentation h̄ sticks up to Δs_max = c h̄ A, or up to Δθ_max = ``TWIST_SLIP`` c h̄. This is Coulomb's
+law: the force 8 G A Δs / (2 − ν) reaches μ P, with P = K h̄ π A² of a layer of foundation modulus K, so c = π μ K (2 − ν) / (8 G). Force F
+and couple M together stay on or within an ellipsoid, (F / F_max)² + (M / M_max)² = 1 (Howe and Cutkosky, Practical force-motion models for
+sliding manipulation, IJRR 15(6), 1996). Beyond it the contact slips along the ellipsoid's normal. F and M are linear in Δs and Δθ, so
+after slip these are
 
     Δs / (1 + γ), Δθ / (1 + b γ)      the least γ ≥ 0 that puts both within the ellipsoid      b = 1 / ``TWIST_SLIP``²
 
@@ -41,7 +42,7 @@ import drjit as dr
 import numpy as np
 
 from raytac.gel.surface import GelSurface
-from raytac.markers.contacts import TWIST_SLIP, ContactCells, Contacts, ContactSamples
+from raytac.markers.contacts import TWIST_SLIP, ContactCells, Contacts, ContactSamples, kept_shares
 from raytac.optics.runtime import load_mitsuba, no_collection
 from raytac.specs.marker_motion import MarkerMotionSpec
 
@@ -227,25 +228,16 @@ def _sticking(mi: Any, place: Any, row: list[Any], kappa: Any, reach: Any, slip:
     weight = 2 / math.pi * a.x
     fade = dr.exp(-beyond / ((dr.sqrt(r2) + radius) * reach))
     along = dr.dot(x, shear) / dr.maximum(dr.squared_norm(x), 1e-18) * x
-    sheared = weight * fade * ((asin - kappa * g) * shear + 2 * kappa * g * along)
+    sheared = weight * ((fade * asin - kappa * g) * shear + 2 * kappa * g * along)
     wt = weight * (asin - g)
     return weight * fade * asin, sheared, wt, wt * _turned(mi, x, twist)
 
 
 def _limited(shear: Any, twist: Any, shear_max: Any, twist_max: Any) -> tuple[Any, Any]:
-    """Shear and twist of the skin where the contact slips, from those of the object.
-
-    Newton's method on 1 / √(x² + y²) = 1, which is a straight line in γ for b = 1, from where the larger of the two alone would be.
-    """
-    ratio = 1 / TWIST_SLIP**2
-    x0, y0 = dr.norm(shear) / dr.maximum(shear_max, 1e-12), dr.abs(twist) / dr.maximum(twist_max, 1e-12)
-    gamma = dr.maximum(dr.maximum(x0 - 1, (y0 - 1) / ratio), 0)
-    for _ in range(_LIMIT_STEPS):
-        p, q = 1 + gamma, 1 + ratio * gamma
-        x2, y2 = dr.square(x0 / p), dr.square(y0 / q)
-        n = dr.sqrt(x2 + y2)
-        gamma += n * n * dr.maximum(n - 1, 0) / dr.maximum(x2 / p + ratio * y2 / q, 1e-12)
-    return shear / (1 + gamma), twist / (1 + ratio * gamma)
+    """Shear and twist of the skin where the contact slips, from those of the object."""
+    x, y = dr.norm(shear) / dr.maximum(shear_max, 1e-12), dr.abs(twist) / dr.maximum(twist_max, 1e-12)
+    sheared, turned = kept_shares(x, y, _LIMIT_STEPS, dr.sqrt, dr.maximum)
+    return sheared * shear, turned * twist
 
 
 def _beyond_ellipse(x: Any, xx: Any, xy: Any, yy: Any) -> Any:

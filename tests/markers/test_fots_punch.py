@@ -83,12 +83,8 @@ def by_loop(punch: PunchSpec, contacts: list[tuple[float, ...]], grid: PadGrid, 
             g = t * math.sqrt(max(1 - t * t, 0.0))
             fade = math.exp(-(r - radius) / punch.reach)
             hat = x / max(np.hypot(*x), 1e-12)
-            shears += (
-                2
-                / math.pi
-                * fade
-                * ((math.asin(t) - punch.anisotropy * g) * shear + 2 * punch.anisotropy * g * hat * (hat @ shear))
-            )
+            bent = punch.anisotropy * g
+            shears += 2 / math.pi * ((fade * math.asin(t) - bent) * shear + 2 * bent * hat * (hat @ shear))
             es += 2 / math.pi * fade * math.asin(t)
             w = 2 / math.pi * (math.asin(t) - g)
             twists += w * np.array(

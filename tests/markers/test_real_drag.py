@@ -1,0 +1,92 @@
+"""FOTS' shear against a real drag and against the linear elasticity of a bonded layer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.sparse.linalg import LinearOperator, cg
+
+from raytac.gel.surface import PadGrid, make_grid
+from raytac.specs import PunchSpec, load_sensor
+from tests.markers.test_fots_punch import moved
+
+MINI = load_sensor("gelsight_mini")
+PIXEL = 0.0532e-3
+GRID: PadGrid = make_grid(MINI.gelpad, 0.4e-3)
+
+
+def punch() -> PunchSpec:
+    """The Mini's, of which nothing slips."""
+    assert MINI.marker_motion is not None and MINI.marker_motion.punch is not None
+    return replace(MINI.marker_motion.punch, slip=1e9)
+
+
+def test_a_real_drag_is_followed() -> None:
+    """98 dots of another gel, of which the ball's place, radius of contact, drag and turn and one motion of all dots are fitted."""
+    x, y, dx, dy = PIXEL * np.loadtxt(Path(__file__).with_name("real_drag.csv"), delimiter=",", skiprows=3, unpack=True)
+    places, motion = np.stack([x, y], axis=1), np.stack([dx, dy], axis=1)
+    middle = places.mean(axis=0)
+
+    def misses(p: np.ndarray) -> np.ndarray:
+        (gx, gy, sx, sy, cx, cy), radius, turn = 1e-3 * p[:6], 1e-3 * p[6], p[7]
+        contact = gx + sx, gy + sy, sx, sy, turn, radius**2, 0.0, radius**2, 1e-3
+        return (moved(GRID, punch(), [contact], places - middle) + np.array([cx, cy]) - motion).ravel()
+
+    fit = least_squares(
+        misses, [0.0, 0.0, 0.0, 0.5, 0.0, 0.1, 2.3, 0.0], x_scale=[1, 1, 0.1, 0.1, 0.1, 0.1, 1, 0.1], diff_step=1e-2
+    )
+    left = np.sqrt((fit.fun**2).sum() / len(places))
+    print(f"{1e6 * left:.1f} um of {1e6 * np.sqrt((motion**2).sum(axis=1).mean()):.1f}")
+    assert left < 25e-6
+
+
+def layer(radius: float, thickness: float, poisson: float, n: int = 128) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distance from the middle [m] and motion along and across a shear by 1, around a disc that sticks to a bonded layer.
+
+    Traction by conjugate gradients; its displacements by the layer's compliance in the Fourier domain.
+    """
+    size = 10.0 * thickness
+    place = (np.arange(n) - n // 2) * size / n
+    x, y = np.meshgrid(place, place, indexing="ij")
+    inside = x**2 + y**2 <= radius**2
+    wave = 2.0 * np.pi * np.fft.fftfreq(n, size / n)
+    kx, ky = np.meshgrid(wave, wave, indexing="ij")
+    k = np.hypot(kx, ky)
+    k[0, 0] = 1e-6 / thickness
+    s, kappa = np.minimum(k * thickness, 40.0), 3.0 - 4.0 * poisson
+    plane = (2.0 * kappa * np.sinh(2.0 * s) + 4.0 * s) / (2.0 * kappa * np.cosh(2.0 * s) + 1.0 + kappa**2 + 4.0 * s**2)
+    plane, out = (1.0 - poisson) / k * plane, np.tanh(s) / k
+    plane[0, 0] = out[0, 0] = thickness
+    cos, sin = kx / k, ky / k
+    along, mixed, across = plane * cos**2 + out * sin**2, (plane - out) * cos * sin, plane * sin**2 + out * cos**2
+
+    def displacement(traction: np.ndarray) -> np.ndarray:
+        full = np.zeros((2, n, n))
+        full[:, inside] = traction.reshape(2, -1)
+        tx, ty = np.fft.fft2(full)
+        return np.fft.ifft2(np.stack([along * tx + mixed * ty, mixed * tx + across * ty])).real
+
+    count = int(inside.sum())
+    inner = LinearOperator((2 * count, 2 * count), matvec=lambda q: displacement(q)[:, inside].ravel(), dtype=float)  # type: ignore[call-arg]
+    traction, _ = cg(inner, np.repeat([1.0, 0.0], count), rtol=1e-4)
+    moved = displacement(traction)[0]
+    return place[n // 2 :], moved[n // 2 :, n // 2], moved[n // 2, n // 2 :]
+
+
+@pytest.mark.parametrize("radius", [1.6e-3, 2.4e-3])
+def test_around_a_contact_the_skin_moves_nearly_as_that_of_a_bonded_layer(radius: float) -> None:
+    gel, shear = MINI.gelpad, 1e-5
+    r, along, across = layer(radius, gel.thickness, gel.poisson_ratio)
+    near = (r > 1.2 * radius) & (r < 10e-3)
+    contact = shear, 0.0, shear, 0.0, 0.0, radius**2, 0.0, radius**2, 1e-3
+    zero = np.zeros(int(near.sum()))
+    there = [
+        moved(GRID, punch(), [contact], np.stack(places, axis=1))[:, 0] / shear for places in ((r[near], zero), (zero, r[near]))
+    ]
+    for fots, elastic, most in zip(there, (along[near], across[near]), (0.08, 0.11), strict=True):
+        print(np.round(np.stack([1e3 * r[near], fots, elastic]), 2))
+        assert np.abs(fots - elastic).max() < most
