@@ -168,7 +168,7 @@ class FotsKernel:
             dr.minimum(r1, mi.Int32((place.y + reach - y0) / dy) + 1),
         )
         r1 = dr.select(c0 < c1, r1, r0)
-        p0, p1 = c0 // _PACKET, (c1 - 1) // _PACKET
+        p0, p1, shrink = c0 // _PACKET, (c1 - 1) // _PACKET, dr.exp(-2 * ld * dx * dx)
 
         def inside(p: Any, r: Any, sx: Any, sy: Any) -> Any:
             return r < r1
@@ -177,9 +177,12 @@ class FotsKernel:
             depths = dr.gather(mi.Vector4f, frame, first + r * self._packets + p)
             ex, ey = place.x - (x0 + mi.Float(p * _PACKET) * dx), place.y - (y0 + mi.Float(r) * dy)
             total, along = mi.Float(0), mi.Float(0)
+            # From one sample to the next the Gaussian changes by a factor, and that by a constant one: two exponentials a packet.
+            gaussian, factor = dr.exp(-ld * (ex * ex + ey * ey)), dr.exp(ld * dx * (2 * ex - dx))
             for h in depths:
-                w = h * dr.exp(-ld * (ex * ex + ey * ey))
+                w = h * gaussian
                 total, along, ex = total + w, along + w * ex, ex - dx
+                gaussian, factor = gaussian * factor, factor * shrink
             wrap = p >= p1
             return dr.select(wrap, p0, p + 1), dr.select(wrap, r + 1, r), sx + along, sy + total * ey
 

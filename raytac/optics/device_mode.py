@@ -91,6 +91,7 @@ class DeviceMode(ABC):
         self.slab = Slab.from_spec(sensor)
         self.camera = Pinhole.from_spec(sensor.camera, resolution, self.slab)
         self._memory = total_memory(self.device)
+        self._fits = 0  # environments that are known to fit
         self._grid: PadGrid | None = None
         # One recording a batch size: a recording would replay at another size by scaling its launches, which is not what B means.
         self._frozen: dict[tuple[str, bool, int], Callable[..., Any]] = {}
@@ -139,8 +140,8 @@ class DeviceMode(ABC):
             InputError: the camera sees beyond the pad, or a second grid.
         """
         if self._grid is not None:
-            same = all(np.array_equal(getattr(grid, name), getattr(self._grid, name)) for name in ("x", "y", "rest"))
-            if grid is not self._grid and not same:
+            names = "x", "y", "rest"
+            if grid is not self._grid and not all(np.array_equal(getattr(grid, k), getattr(self._grid, k)) for k in names):
                 rule = f"one optical mode renders one grid and rest surface, the first that it was given, {self._grid.shape} here"
                 raise InputError("surface.grid", value=grid.shape, rule=rule)
             return
@@ -167,11 +168,15 @@ class DeviceMode(ABC):
 
     def _check_batch(self, envs: int, grid: PadGrid) -> None:
         """Raise InputError for a batch that would not fit, before Dr.Jit ends the process over it."""
+        if grid is self._grid and envs <= self._fits:
+            return
         each, most = self.memory_per_env(grid), self.largest_batch(grid)
         if each and envs > most:
             rule = f"must be at most {most}: an environment takes {each / 1e6:.1f} MB, this {self.device} has "
             rule += f"{self._memory / 1e9:.1f} GB and an array at most 2^32 values; render in parts"
             raise InputError("number of environments", value=envs, rule=rule)
+        if grid is self._grid:
+            self._fits = envs
 
     @property
     def _lit(self) -> bool:

@@ -44,23 +44,26 @@ def numbers(name: str, index: np.ndarray) -> Numbers:
     return Numbers(tuple(name if i >= 0 else "" for i in flat), tuple(max(i, 0) for i in flat), np.shape(index))
 
 
-def site_pose(site: int) -> Numbers:
-    """Pose (4, 4) of a site by its index."""
+def site_pose(site: int | np.ndarray) -> Numbers:
+    """Pose (4, 4) of a site by its index; (n, 4, 4) of n sites."""
     return _pose("site_xmat", "site_xpos", site)
 
 
-def body_pose(body: int) -> Numbers:
-    """Pose (4, 4) of a body by its index."""
+def body_pose(body: int | np.ndarray) -> Numbers:
+    """Pose (4, 4) of a body by its index; (n, 4, 4) of n bodies."""
     return _pose("xmat", "xpos", body)
 
 
-def _pose(turn: str, place: str, i: int) -> Numbers:
-    name, index = [""] * 16, [0] * 15 + [1]
-    for row in range(3):
-        for column in range(3):
-            name[4 * row + column], index[4 * row + column] = turn, 9 * i + 3 * row + column
-        name[4 * row + 3], index[4 * row + 3] = place, 3 * i + row
-    return Numbers(tuple(name), tuple(index), (4, 4))
+def _pose(turn: str, place: str, indices: int | np.ndarray) -> Numbers:
+    name: list[str] = []
+    index: list[int] = []
+    for i in np.ravel(indices).tolist():
+        for row in range(3):
+            name += [turn, turn, turn, place]
+            index += [9 * i + 3 * row, 9 * i + 3 * row + 1, 9 * i + 3 * row + 2, 3 * i + row]
+        name += [""] * 4
+        index += [0, 0, 0, 1]
+    return Numbers(tuple(name), tuple(index), (*np.shape(indices), 4, 4))
 
 
 class StateReader:

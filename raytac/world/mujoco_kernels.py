@@ -54,6 +54,7 @@ class Memory:
     cdof: wp.int32
     qacc_smooth: wp.int32
     qacc: wp.int32
+    qacc_warmstart: wp.int32
     efc_J_rownnz: wp.int32
     efc_J_rowadr: wp.int32
     efc_J_colind: wp.int32
@@ -291,6 +292,10 @@ def correct_lifts(memory: Memory, steps: Steps, slots: Slots):
     before = doubles(memory, env, memory.efc_vel)
     reference = doubles(memory, env, memory.efc_aref)
     acceleration = doubles(memory, env, memory.qacc)
+    # The next solve, which differs by a lift, begins with this solution.
+    guess = doubles(memory, env, memory.qacc_warmstart)
+    for k in range(memory.nv):
+        guess[k] = acceleration[k]
     row = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
     slides = wp.int32(0)
     for pad in range(slots.held.shape[1]):

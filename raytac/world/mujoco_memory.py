@@ -99,6 +99,6 @@ _BALLS = """<mujoco><option cone="elliptic"/><worldbody><geom type="plane" size=
 <geom size=".1"/></body><body pos="1 0 0"><freejoint/><geom size=".1"/><site/></body></worldbody></mujoco>"""
 _ARRAYS = (
     "qpos", "qvel", "xpos", "xmat", "site_xpos", "site_xmat", "subtree_com", "cvel", "cdof", "qacc_smooth", "qacc",
-    "efc_J_rownnz", "efc_J_rowadr", "efc_J_colind", "efc_J", "efc_D", "efc_R", "efc_vel", "efc_aref", "efc_force",
+    "qacc_warmstart", "efc_J_rownnz", "efc_J_rowadr", "efc_J_colind", "efc_J", "efc_D", "efc_R", "efc_vel", "efc_aref", "efc_force",
 )  # fmt: skip
 _CONTACT = ("dist", "pos", "frame", "friction", "mu", "dim", "geom1", "geom2", "geom", "efc_address")

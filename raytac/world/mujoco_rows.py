@@ -250,7 +250,7 @@ def _blank() -> mujoco.MjContact:
 
 _POINTERS = (
     "contact", "qpos", "qvel", "xpos", "xmat", "site_xpos", "site_xmat", "subtree_com", "cvel", "cdof", "qacc_smooth", "qacc",
-    "efc_J_rownnz", "efc_J_rowadr", "efc_J_colind", "efc_J", "efc_D", "efc_R", "efc_vel", "efc_aref", "efc_force",
+    "qacc_warmstart", "efc_J_rownnz", "efc_J_rowadr", "efc_J_colind", "efc_J", "efc_D", "efc_R", "efc_vel", "efc_aref", "efc_force",
 )  # fmt: skip
 _DOUBLES = ("dist", "pos", "frame", "friction", "mu")
 _INTEGERS = ("dim", "geom1", "geom2", "geom", "efc_address")

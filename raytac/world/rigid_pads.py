@@ -29,6 +29,7 @@ from raytac.gel.surface import PadGrid
 from raytac.physics.base import PadReading
 from raytac.physics.rigid.gel_contact import Bodies, GelContact
 from raytac.robots.frames import body_poses, site_poses
+from raytac.robots.states import StateReader, body_pose, site_pose
 from raytac.se3 import inverse
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.forbidden_overlap import BondedFaces
@@ -100,6 +101,7 @@ class RigidPads:
             hard=is_hard(composed.model) if composed.scene is not None else np.zeros(composed.model.ngeom, bool),
         )
         self._surfaces = PadSurfaces(dict(zip(self._names, self._gels, strict=True)), shapes, num_envs)
+        self._reader: StateReader | None = None
         self.report: dict[str, np.ndarray] = {}
         self._added: list[tuple[int, int]] = []
 
@@ -226,12 +228,14 @@ class RigidPads:
     ) -> PadReading:
         """Surface and forces of one sensor on the nodes of ``grid``, for the environments named, one row each; None is all."""
         rows, index = np.arange(len(datas)) if envs is None else np.asarray(envs), self._names.index(name)
-        some, failed = [datas[b] for b in rows.tolist()], failed[rows]
-        world_from_pad = site_poses(some, self._site_index)
+        if self._reader is None or not self._reader.reads(datas):
+            self._reader = StateReader(datas, {"pads": site_pose(self._site_index), "bodies": body_pose(self._body_index)})
+        poses, failed = self._reader.values(), failed[rows]
+        world_from_pad, world_from_body = poses["pads"][rows], poses["bodies"][rows]
         return self._surfaces.reading(
             name,
             grid,
-            inverse(world_from_pad[:, index])[:, None] @ body_poses(some, self._body_index),
+            inverse(world_from_pad[:, index])[:, None] @ world_from_body,
             self.wrench(name)[rows],
             failed,
             rows,

@@ -55,6 +55,8 @@ def test_numbers_are_those_that_mujoco_has_now() -> None:
             "q": numbers("qpos", np.array([[2, 0], [-1, 1]])),
             "site": site_pose(site),
             "body": body_pose(body),
+            "sites": site_pose(np.array([site, 0])),
+            "bodies": body_pose(np.array([0, body])),
             "none": numbers("qpos", np.zeros(0)),
             "time": numbers("time", np.array(0)),
         },
@@ -66,6 +68,8 @@ def test_numbers_are_those_that_mujoco_has_now() -> None:
         np.testing.assert_array_equal(now["time"], [data.time for data in datas])
         np.testing.assert_array_equal(now["site"], site_poses(datas, site))
         np.testing.assert_array_equal(now["body"], body_poses(datas, body))
+        np.testing.assert_array_equal(now["sites"], site_poses(datas, np.array([site, 0])))
+        np.testing.assert_array_equal(now["bodies"], body_poses(datas, np.array([0, body])))
         assert now["none"].shape == (3, 0)
         for data in datas:
             mujoco.mj_step(arm.model, data)

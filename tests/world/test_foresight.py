@@ -81,6 +81,24 @@ def test_a_slide_begins_and_ends_under_the_same_load(mass: float, timestep: floa
     assert max(slip) == pytest.approx(0.3, rel=1e-3)
 
 
+def test_a_step_begins_with_the_solution_that_foresaw_its_slide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So MuJoCo does not search for it again."""
+    solves, iterations, solve = [0], [], mujoco.mj_fwdConstraint
+
+    def count(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        solves[0] += 1
+        solve(model, data)
+
+    monkeypatch.setattr(mujoco, "mj_fwdConstraint", count)
+    world = flat_world(SLIDE.format(0.02), 5e-3, SERVO, touches={"body": 0.3})
+    for k in range(60):
+        before = solves[0]
+        world.step(np.array([0.02 * (k > 20), -1.0]))
+        if solves[0] > before:
+            iterations.append(int(world.data[0].solver_niter[0]))
+    assert iterations and not any(iterations)
+
+
 def test_a_body_that_slides_into_the_gel_sinks_as_deep_as_one_that_does_not() -> None:
     """Friction takes no part in the normal force of an impact."""
     deepest = []
