@@ -63,7 +63,7 @@ class Part:
         size = max(float((high.max(axis=0) - start).max()) / _BLOCKS, 1e-12)
         cell = ((0.5 * (low + high) - start) / size).astype(np.int64) @ np.array([1, _BLOCKS + 1, (_BLOCKS + 1) ** 2])
         order = np.argsort(cell)
-        first = np.flatnonzero(np.diff(cell[order], prepend=-1))
+        first = np.flatnonzero(np.append(True, np.diff(cell[order]) > 0))
         low, high = np.minimum.reduceat(low[order], first), np.maximum.reduceat(high[order], first)
         return 0.5 * (low + high), 0.5 * (high - low)
 
