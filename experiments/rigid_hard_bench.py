@@ -46,6 +46,8 @@ COARSE = make_grid(GEL, 0.8e-3)
 DEEPEST = 20
 FAST = 25.0
 """Force with which fingers close that are far from a body [N]: some 0.25 m/s against the servo's damping."""
+NEAR = 5.0
+"""Force with which they close over the last millimetres, until both feel the body [N]."""
 SERVO = 1e4
 """Gain of the floating gripper's opening [N/m]."""
 
@@ -272,18 +274,22 @@ class Grasps:
         world.reset(bodies={self._name: poses})
         begin = 0.6 * seconds
 
-        def steer(wide: float, press: float, data: mujoco.MjData, time: float) -> None:
+        # By any pad, and by all of them at once.
+        felt, gripped, failed = (np.zeros(self.count, bool) for _ in range(3))
+
+        def steer(env: int, wide: float, press: float, data: mujoco.MjData, time: float) -> None:
             gap = float(data.qpos[fingers].sum())
-            data.ctrl[opening] = max(gap - (press if gap < wide + 2e-3 else FAST) / SERVO, 0.0)
+            closing = press if gripped[env] else NEAR if gap < wide + 2e-3 else FAST
+            data.ctrl[opening] = max(gap - closing / SERVO, 0.0)
             data.xfrc_applied[self._index, 2] = -0.2 * press if time > begin else 0.0
 
-        controls = [partial(steer, *one) for one in zip(width.tolist(), force.tolist(), strict=True)]
-        felt, failed = np.zeros(self.count, bool), np.zeros(self.count, bool)
+        controls = [partial(steer, *one) for one in zip(range(self.count), width.tolist(), force.tolist(), strict=True)]
         for step in range(round(seconds / dt)):
             state = world.step(controls)
             failed = state.failed
-            for name in world.sensor_names:
-                felt |= np.nan_to_num(np.abs(state.wrench[name][:, 2])) > 1e-2
+            touched = np.array([np.nan_to_num(np.abs(state.wrench[name][:, 2])) > 1e-2 for name in world.sensor_names])
+            felt |= touched.any(axis=0)
+            gripped |= touched.all(axis=0)
             if step % 4 == 0:
                 self._look(counted)
         self.failed += int(failed[:counted].sum())

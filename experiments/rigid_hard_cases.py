@@ -563,7 +563,7 @@ def grasps(name: str, count: int, seed: int, piece: int) -> Outcome:
     outcome.add("beyond the bonded face", 1e3 * grasp.penetration, 0.0, "mm")
     outcome.add("states that are not finite", grasp.broken, 0.0)
     outcome.add("friction beyond its cone", grasp.cone, 0.01)
-    outcome.add("share that is felt", grasp.felt / count, 0.5, at_least=True)
+    outcome.add("share that is felt", grasp.felt / count, 0.9, at_least=True)
     return outcome
 
 

@@ -22,6 +22,8 @@ _SIZES = {
 }
 _LONGEST = 1e3
 """Greatest length and offset of a part [m]: beyond it, rounding hides anything of a pad's scale."""
+_BLOCKS = 16
+"""Blocks of triangles along the longest edge of a mesh."""
 PART_KINDS = (*_SIZES, "mesh", "relief")
 """Kinds of ``Part``; MuJoCo's ``hfield`` becomes a ``mesh`` by ``hfield_part``."""
 
@@ -52,10 +54,17 @@ class Part:
     """True if it is one solid with the object's first part and starts at that part's flat lower face, z = 0 in the object frame."""
 
     @cached_property
-    def box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centre and half edges (3,) [m] of the box about the vertices of a mesh or relief, along the axes of the part."""
-        assert self.vertices is not None
-        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
+    def blocks(self) -> tuple[np.ndarray, np.ndarray]:
+        """Centres and half edges (n, 3) [m] of boxes along the part's axes that together hold all triangles of a mesh or relief."""
+        assert self.vertices is not None and self.faces is not None
+        corners = self.vertices[self.faces]
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        start = low.min(axis=0)
+        size = max(float((high.max(axis=0) - start).max()) / _BLOCKS, 1e-12)
+        cell = ((0.5 * (low + high) - start) / size).astype(np.int64) @ np.array([1, _BLOCKS + 1, (_BLOCKS + 1) ** 2])
+        order = np.argsort(cell)
+        first = np.flatnonzero(np.append(True, np.diff(cell[order]) > 0))
+        low, high = np.minimum.reduceat(low[order], first), np.maximum.reduceat(high[order], first)
         return 0.5 * (low + high), 0.5 * (high - low)
 
 

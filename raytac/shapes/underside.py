@@ -14,7 +14,7 @@ from raytac.shapes.rasterize import lowest_of_triangles
 from raytac.shapes.relief import looks_down, relief_underside
 
 _SLACK = 1e-9
-"""Boxes are widened by this [m] against rounding."""
+"""Blocks are widened by this [m] against rounding."""
 _NODES = 32768
 """Nodes of all environments that are processed at once, so that they stay in a core's cache."""
 
@@ -81,11 +81,13 @@ def _part_bounds(part: Part, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return bounds(part.kind, part.size, pose)
 
 
-def _box_of_vertices(part: Part, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds (3,) [m] of a mesh or relief that need no vertex to be placed; those of a tilted one are wider than it is."""
-    centre, half = part.box
-    middle, reach = pose[:3, :3] @ centre + pose[:3, 3], np.abs(pose[:3, :3]) @ half + _SLACK
-    return middle - reach, middle + reach
+def _may_show(part: Part, pose: np.ndarray, x: np.ndarray, y: np.ndarray, below: float) -> bool:
+    """False where no block of a mesh's or relief's triangles is over the nodes and reaches below ``below``, without placing a vertex."""
+    centre, half = part.blocks
+    middle, reach = centre @ pose[:3, :3].T + pose[:3, 3], half @ np.abs(pose[:3, :3]).T + _SLACK
+    near, far = middle - reach, middle + reach
+    is_over = (far[:, 0] >= x[0]) & (near[:, 0] <= x[-1]) & (far[:, 1] >= y[0]) & (near[:, 1] <= y[-1])
+    return bool((is_over & (near[:, 2] <= below)).any())
 
 
 def _lower_onto(lowest: np.ndarray, part: Part, poses: np.ndarray, x: np.ndarray, y: np.ndarray, below: float) -> None:
@@ -132,8 +134,7 @@ def _box_below(part: Part, poses: np.ndarray, low: np.ndarray, high: np.ndarray,
 def _lower_surface_onto(lowest: np.ndarray, part: Part, pose: np.ndarray, x: np.ndarray, y: np.ndarray, below: float) -> None:
     """As ``_lower_onto``, of a mesh or relief in one environment, within its bounding box; ``lowest`` (Ny, Nx)."""
     assert part.vertices is not None and part.faces is not None
-    near, far = _box_of_vertices(part, pose)
-    if near[2] > below or far[0] < x[0] or near[0] > x[-1] or far[1] < y[0] or near[1] > y[-1]:
+    if not _may_show(part, pose, x, y, below):
         return
     as_triangles = part.kind == "mesh" or not looks_down(part, pose)
     placed = part.vertices @ pose[:3, :3].T + pose[:3, 3] if as_triangles else None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments import rigid_hard_cases as hard
-from experiments.rigid_hard_bench import GEL, Bench, Outcome, normal_force, on_pad, within_grip
+from experiments.rigid_hard_bench import GEL, Bench, Grasps, Outcome, normal_force, on_pad, within_grip
 from raytac.errors import InputError
 from raytac.io.metrics import read_metrics
 from raytac.physics.objects import object_parts
@@ -85,6 +85,18 @@ def test_two_pads_press_each_other_beyond_where_their_gels_meet() -> None:
         bench.run(0.4)
         assert bench.normal[-1] == pytest.approx([2.0, 2.0], rel=0.01)
         assert bench.between_pads()[-1] < -0.05e-3
+
+
+def test_a_grasp_with_little_force_has_hold_of_its_body_before_the_load_comes() -> None:
+    radius = 5e-3
+    ball = BodySpec("ball", "sphere", {"radius": radius}, mass=0.03)
+    grasp = Grasps(within_grip([ball], 4e-3, 2.0 * radius + 8e-3), 2)
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, :3, 3] = 4e-3, 1e-3, 2e-3
+    grasp.close(poses, np.full(2, 2.0 * radius), np.array([0.3, 0.3]), 2)
+    assert grasp.felt == 2 and grasp.failed == 0
+    held = np.array([data.qpos[grasp.world.composed.bodies["ball"].qpos :][:3] for data in grasp.world.data])
+    np.testing.assert_allclose(held[:, [0, 2]], poses[:, [0, 2], 3], atol=1e-3)
 
 
 def test_drops_begin_at_one_height_whatever_the_step() -> None:

@@ -334,7 +334,7 @@ def test_impossible_meshes_are_refused() -> None:
 
 
 @pytest.mark.parametrize("kind", ["mesh", "relief"])
-def test_no_vertex_is_placed_of_a_surface_that_its_box_holds_away(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_vertex_is_placed_of_a_surface_that_is_away(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from raytac.shapes import underside
 
     elevation = 1e-3 * np.random.default_rng(0).uniform(size=(9, 9))
@@ -356,3 +356,8 @@ def test_no_vertex_is_placed_of_a_surface_that_its_box_holds_away(kind: str, mon
         assert not placed
         object_height([part], pose[None], X, Y, below=points[:, 2].min() + 1e-6)
         assert placed.pop() and not placed
+        assert part.faces is not None
+        centre, half = part.blocks
+        corners = part.vertices[part.faces]
+        held = (np.abs(corners[:, None] - centre[:, None]) <= half[:, None] + 1e-12).all(axis=(2, 3))
+        assert len(centre) > 8 and held.any(axis=1).all()
