@@ -62,8 +62,8 @@ def compose(scene: TaskScene, physics: str) -> WorldModel:
     spec.option.impratio = 10.0
     # A noslip pass removes that creep, but would undo the shear of a rigid pad's gel.
     spec.option.noslip_iterations = 0 if physics == "rigid" else 4
-    # MuJoCo measures what a solver's iteration gains by the model's mean inertia, an arm's: by its own 1e-8 it stops while forces on a cube
-    # of 50 g are a quarter of a newton apart.
+    # MuJoCo measures what a solver's iteration gains by the model's mean inertia, an arm's: by its own 1e-8 it stops before the forces
+    # on a cube of 50 g are in balance.
     spec.option.tolerance = 1e-10
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     shapes: dict[str, tuple[Part, ...]] = {}
