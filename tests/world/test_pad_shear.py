@@ -306,7 +306,7 @@ def press(data: mujoco.MjData, time: float) -> None:
 
 
 @pytest.mark.parametrize("timestep", [1e-3, 2e-3, 5e-3, 10e-3])
-@pytest.mark.parametrize(("joint", "speed", "power"), [(1, 1e-3, 1.5), (1, 5e-3, 1.5), (2, 0.2, 2.5), (2, 0.8, 2.5)])
+@pytest.mark.parametrize(("joint", "speed", "power"), [(1, 1e-3, 1.5), (1, 5e-3, 1.5), (2, 0.2, 2.5), (2, 0.6, 2.5)])
 def test_in_steady_slow_motion_force_and_stretch_are_those_of_theory(
     timestep: float, joint: int, speed: float, power: float
 ) -> None:

@@ -1,13 +1,11 @@
-"""FOTS' shear against a real drag and against the linear elasticity of a bonded layer."""
+"""FOTS' shear against the linear elasticity of a bonded layer."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 from scipy.sparse.linalg import LinearOperator, cg
 
 from raytac.gel.surface import PadGrid, make_grid
@@ -15,7 +13,6 @@ from raytac.specs import PunchSpec, load_sensor
 from tests.markers.test_fots_punch import moved
 
 MINI = load_sensor("gelsight_mini")
-PIXEL = 0.0532e-3
 GRID: PadGrid = make_grid(MINI.gelpad, 0.4e-3)
 
 
@@ -23,25 +20,6 @@ def punch() -> PunchSpec:
     """The Mini's, of which nothing slips."""
     assert MINI.marker_motion is not None and MINI.marker_motion.punch is not None
     return replace(MINI.marker_motion.punch, slip=1e9)
-
-
-def test_a_real_drag_is_followed() -> None:
-    """98 dots of another gel, of which the ball's place, radius of contact, drag and turn and one motion of all dots are fitted."""
-    x, y, dx, dy = PIXEL * np.loadtxt(Path(__file__).with_name("real_drag.csv"), delimiter=",", skiprows=3, unpack=True)
-    places, motion = np.stack([x, y], axis=1), np.stack([dx, dy], axis=1)
-    middle = places.mean(axis=0)
-
-    def misses(p: np.ndarray) -> np.ndarray:
-        (gx, gy, sx, sy, cx, cy), radius, turn = 1e-3 * p[:6], 1e-3 * p[6], p[7]
-        contact = gx + sx, gy + sy, sx, sy, turn, radius**2, 0.0, radius**2, 1e-3
-        return (moved(GRID, punch(), [contact], places - middle) + np.array([cx, cy]) - motion).ravel()
-
-    fit = least_squares(
-        misses, [0.0, 0.0, 0.0, 0.5, 0.0, 0.1, 2.3, 0.0], x_scale=[1, 1, 0.1, 0.1, 0.1, 0.1, 1, 0.1], diff_step=1e-2
-    )
-    left = np.sqrt((fit.fun**2).sum() / len(places))
-    print(f"{1e6 * left:.1f} um of {1e6 * np.sqrt((motion**2).sum(axis=1).mean()):.1f}")
-    assert left < 25e-6
 
 
 def layer(radius: float, thickness: float, poisson: float, n: int = 128) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
