@@ -111,7 +111,7 @@ def grow(
     """
     k = wp.int32(old)
     low, inner, part = wp.float64(k), shear.inner[env, pad, body, k], old - wp.float64(k)
-    if part > _0 and part < _1:
+    if part > _0 and part < _1 and size > old:  # a stiffness that grows by its last digit may not change the size
         first, second = shear.stretch[env, pad, body, 2 * k], shear.stretch[env, pad, body, 2 * k + 1]
         scale = wp.vec3d(_1, _1, twist)
         if wp.dot(wp.cw_mul(second, scale), second) >= _FRESH * wp.dot(wp.cw_mul(first, scale), first):
