@@ -253,7 +253,7 @@ def drop(mass: float, speed: float, dt: float) -> Outcome:
     outcome = Outcome()
     with Bench(on_pad([ball], dt)) as bench:
         bench.throw((0.0, 0.0, -speed))
-        bench.run(0.25 + gap / speed, lambda b: len(b.normal) > 2 and b.path()[-1, 2] > radius + gap)
+        bench.run(0.25 + gap / speed, lambda b: len(b.normal) > 2 and b.path()[-1, 2] > radius + 0.5 * gap)
         height, speeds = bench.path()[:, 2], bench.speed()[:, 2]
         energy = bench.kinetic(mass) + mass * G * height
         begun = energy[0] + mass * G * (GEL.thickness - radius)  # over the bonded face
