@@ -30,6 +30,8 @@ _INF = wp.constant(wp.float64(float("inf")))
 _STEPS = wp.constant(wp.float64(LAW_POINTS - 1.0))
 DEEPER = wp.constant(wp.float64(((LAW_POINTS - 1.0) / 22.0) ** 2))
 """Depth up to which a law is tabulated at least, of the present one: some 2, so that this is one of the table's own."""
+_FEWEST = wp.constant(wp.float64(6.0))
+"""Steps of the table up to the present depth at least, for which it is stretched."""
 _SHALLOWEST = wp.constant(wp.float64(10e-6))
 """Least depth up to which a law is tabulated [m]."""
 _PI = wp.constant(wp.float64(3.141592653589793))
@@ -46,17 +48,29 @@ class Bins:
 
 
 @wp.func
-def deepest_of(depth: wp.float64, reach: wp.float64, ahead: wp.float64, thickness: wp.float64) -> wp.float64:
-    """Depth [m] up to which the law is tabulated: what a body may reach, but no more than ``ahead`` into the gel or deeper than it is.
+def reached_by(depth: wp.float64, reach: wp.float64, ahead: wp.float64) -> wp.float64:
+    """Depth [m] up to which a law is wanted: what a body may reach, but no more than ``ahead`` into the gel or deeper than it is."""
+    return wp.max(DEEPER * depth, wp.min(depth + reach, wp.max(depth, _0) + ahead))
 
-    It is chosen so that the present depth is one of the table's own, and the gel's thickness at most.
-    """
-    deepest = wp.max(DEEPER * depth, wp.min(depth + reach, wp.max(depth, _0) + ahead))
+
+@wp.func
+def deepest_of(depth: wp.float64, reach: wp.float64, ahead: wp.float64, thickness: wp.float64) -> wp.float64:
+    """Depth [m] up to which the law is tabulated: as ``reached_by``, but so that the present depth is one of the table's own, and the gel's
+    thickness at most."""
+    deepest = reached_by(depth, reach, ahead)
     if depth > _0 and deepest < thickness:
         k = wp.floor(_STEPS * wp.sqrt(depth / deepest) + wp.float64(1e-9))
-        if k >= wp.float64(6.0):
+        if k >= _FEWEST:
             deepest = depth * (_STEPS / k) * (_STEPS / k)
     return wp.max(wp.min(deepest, thickness), wp.max(depth, _SHALLOWEST))
+
+
+@wp.func
+def most_deepest(depth: wp.float64, reach: wp.float64, ahead: wp.float64) -> wp.float64:
+    """``deepest_of`` [m] at most, of a contact that is as deep as that or somewhat deeper."""
+    deepest = reached_by(depth, reach, ahead)
+    k = wp.floor(_STEPS * wp.sqrt(wp.max(depth, _0) / deepest))
+    return wp.where(k < _FEWEST, deepest, deepest * (k + wp.float64(1.0)) * (k + wp.float64(1.0)) / (k * k))
 
 
 @wp.func
@@ -70,12 +84,15 @@ def clear_bins(bins: Bins, block: wp.int32, lane: wp.int32, lanes: wp.int32):
 
 
 @wp.func
-def add_node(bins: Bins, block: wp.int32, gap: wp.float64, deepest: wp.float64):
-    """Add a node with a gap at touch in [0, ``deepest`` / 2) [m]; counts and extremes do not depend on the order."""
-    k = wp.min(wp.int32(wp.sqrt(wp.float64(2.0) * gap / deepest) * _SCALE), _BINS - 1)
-    wp.atomic_add(bins.count, block, k, 1)
-    wp.atomic_min(bins.low, block, k, gap)
-    wp.atomic_max(bins.high, block, k, gap)
+def add_node(
+    count: wp.array(dtype=wp.int32), low: wp.array(dtype=wp.float64), high: wp.array(dtype=wp.float64), gap: wp.float64,
+    share: wp.float64,
+):  # fmt: skip
+    """Add a node with a gap at touch [m], ``share`` in [0, 1) of the farthest that counts; the result does not depend on the order."""
+    k = wp.min(wp.int32(wp.sqrt(share) * _SCALE), _BINS - 1)
+    wp.atomic_add(count, k, 1)
+    wp.atomic_min(low, k, gap)
+    wp.atomic_max(high, k, gap)
 
 
 @wp.func
