@@ -7,6 +7,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import warp as wp
 
 from raytac.physics.rigid.placed_kernels import Pads, Placed, across, larger, smaller, under, window
@@ -25,7 +27,7 @@ _INF = wp.constant(wp.float64(float("inf")))
 
 
 @wp.func
-def total_of(value: wp.float64) -> wp.float64:
+def total_of(value: Any):
     """Sum over the block; also a barrier."""
     if wp.block_dim() == 1:  # of a CPU, where a tile takes longer than a node
         return value
@@ -33,21 +35,7 @@ def total_of(value: wp.float64) -> wp.float64:
 
 
 @wp.func
-def count_of(value: wp.int32) -> wp.int32:
-    if wp.block_dim() == 1:
-        return value
-    return wp.tile_sum(wp.tile(value))[0]
-
-
-@wp.func
-def least_of(value: wp.float64) -> wp.float64:
-    if wp.block_dim() == 1:
-        return value
-    return wp.tile_min(wp.tile(value))[0]
-
-
-@wp.func
-def first_of(value: wp.int32) -> wp.int32:
+def least_of(value: Any):
     if wp.block_dim() == 1:
         return value
     return wp.tile_min(wp.tile(value))[0]
@@ -218,7 +206,7 @@ def nodes_near(gap: wp.array(dtype=wp.float64), lane: wp.int32, nx: wp.int32, ny
                 x0, x1, y0, y1 = wp.min(x0, i), wp.min(x1, -i), wp.min(y0, j), wp.min(y1, -j)
             i += across()
         j += wp.block_dim() // across()
-    x0, x1, y0, y1 = first_of(x0), -first_of(x1), first_of(y0), -first_of(y1)
+    x0, x1, y0, y1 = least_of(x0), -least_of(x1), least_of(y0), -least_of(y1)
     if x0 == _MANY:
         return wp.vec4d(_INF, _INF, _INF, _INF)
     return wp.vec4d(wp.float64(x0), wp.float64(x1), wp.float64(y0), wp.float64(y1)) + wp.vec4d(-_2, _2, -_2, _2)

@@ -18,8 +18,6 @@ from raytac.physics.rigid.law_kernels import DEEPER, Bins, add_node, clear_bins,
 from raytac.physics.rigid.node_kernels import (
     between_nodes,
     box_around,
-    count_of,
-    first_of,
     is_convex,
     least_of,
     look_at_nodes,
@@ -174,7 +172,7 @@ def measure_pair(
         count, own_least, near_node, own_low, low_node = look_at_nodes(
             gaps, pads.lines, fx + i0, fy + j0, lane, nx, ny, bond, zero
         )
-        count = count_of(count)
+        count = total_of(count)
         if mode == _LAW:
             if (count >= _ENOUGH and level >= _FIRST) or level >= last:
                 busy = 0
@@ -189,12 +187,12 @@ def measure_pair(
             continue
         lower = least_of(own_low)
         if lower < low:
-            low_node = first_of(wp.where(own_low == lower, low_node, _MANY))
+            low_node = least_of(wp.where(own_low == lower, low_node, _MANY))
             low, low_level, low_i, low_j = lower, wp.int32(level), i0 + low_node % nx, j0 + low_node // nx
         least = least_of(own_least)
         i, j = wp.int32(0), wp.int32(0)  # of the least gap
         if least < _INF:
-            near_node = first_of(wp.where(own_least == least, near_node, _MANY))
+            near_node = least_of(wp.where(own_least == least, near_node, _MANY))
             i, j = near_node % nx, near_node // nx
         done = level >= last or (count >= _ENOUGH and level >= _FIRST)
         beyond = wp.bool(False)
@@ -269,10 +267,7 @@ def measure_pair(
     if touching == 0:
         shift = wp.min(_HALF * deepest, _JUST_TOUCHING) - depth
     s, szz, su, sv = wp.float64(0.0), wp.float64(0.0), wp.vec3d(), wp.vec3d()
-    # Of the overlap's area: number of nodes, first and second moments.
-    n1, nx1, ny1, nxx, nxy, nyy = (
-        wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0),
-    )  # fmt: skip
+    first, second = wp.vec3d(), wp.vec3d()  # number of nodes and first moments, second moments of the overlap's area
     clear_bins(work.bins, block, lane, lanes)
     total_of(_0)
     bin_count, bin_low, bin_high = work.bins.count[block], work.bins.low[block], work.bins.high[block]
@@ -281,7 +276,7 @@ def measure_pair(
     j = lane // across()
     while j < ny:
         v = pads.lines[fy + j0 + j] + wp.vec3d()
-        row_s, row_n, row_x = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+        row_s, row_n, row_x, row_xx = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
         i = lane % across()
         while i < nx:
             gap = gaps[j * nx + i] + _0
@@ -293,7 +288,7 @@ def measure_pair(
                 su += overlap * u
                 row_n += wp.float64(1.0)
                 row_x += u[0]
-                nxx += u[0] * u[0]
+                row_xx += u[0] * u[0]
             at_touch = larger(gap + depth, _0)
             if at_touch < farthest:
                 add_node(bin_count, bin_low, bin_high, at_touch, at_touch * inverse)
@@ -302,17 +297,15 @@ def measure_pair(
             i += across()
         s += row_s
         sv += row_s * v
-        n1 += row_n
-        nx1 += row_x
-        ny1 += row_n * v[0]
-        nxy += row_x * v[0]
-        nyy += row_n * v[0] * v[0]
+        first += wp.vec3d(row_n, row_x, row_n * v[0])
+        second += wp.vec3d(row_xx, row_x * v[0], row_n * v[0] * v[0])
         j += wp.block_dim() // across()
     beyond_law = least_of(beyond_law)
     s, szz = total_of(s), total_of(szz)
     sx, sz, slope_x = total_of(su[0]), total_of(su[1] + sv[1]), total_of(su[2])
     sy, slope_y = total_of(sv[0]), total_of(sv[2])
-    n1, nx1, ny1, nxx, nxy, nyy = total_of(n1), total_of(nx1), total_of(ny1), total_of(nxx), total_of(nxy), total_of(nyy)
+    n1, nx1, ny1 = total_of(first[0]), total_of(first[1]), total_of(first[2])
+    nxx, nxy, nyy = total_of(second[0]), total_of(second[1]), total_of(second[2])
     if lane == 0:
         rows.valid[row] = 1
         rows.depth[row] = depth
