@@ -51,6 +51,8 @@ DEEPER = wp.constant(wp.float64(((LAW_POINTS - 1.0) / 22.0) ** 2))
 """Depth up to which a law is tabulated at least, of the present one: some 2, so that this is one of the table's own. Nodes with gaps
 up to half of it count, and at the present depth the contact has no others. At twice that depth the contact on a layer may be wider: there a
 ball's force is 6 % too small if its radius of contact is half the thickness, 17 % if it is the thickness."""
+_FEWEST = wp.constant(wp.float64(6.0))
+"""Steps of the table up to the present depth at least, for which it is stretched."""
 _SHALLOWEST = wp.constant(wp.float64(10e-6))
 """Least depth up to which a law is tabulated [m]."""
 _PI = wp.constant(wp.float64(3.141592653589793))
@@ -67,17 +69,29 @@ class Bins:
 
 
 @wp.func
-def deepest_of(depth: wp.float64, reach: wp.float64, ahead: wp.float64, thickness: wp.float64) -> wp.float64:
-    """Depth [m] up to which the law is tabulated: what a body may reach, but no more than ``ahead`` into the gel or deeper than it is.
+def reached_by(depth: wp.float64, reach: wp.float64, ahead: wp.float64) -> wp.float64:
+    """Depth [m] up to which a law is wanted: what a body may reach, but no more than ``ahead`` into the gel or deeper than it is."""
+    return wp.max(DEEPER * depth, wp.min(depth + reach, wp.max(depth, _0) + ahead))
 
-    It is chosen so that the present depth is one of the table's own, and the gel's thickness at most.
-    """
-    deepest = wp.max(DEEPER * depth, wp.min(depth + reach, wp.max(depth, _0) + ahead))
+
+@wp.func
+def deepest_of(depth: wp.float64, reach: wp.float64, ahead: wp.float64, thickness: wp.float64) -> wp.float64:
+    """Depth [m] up to which the law is tabulated: as ``reached_by``, but so that the present depth is one of the table's own, and the gel's
+    thickness at most."""
+    deepest = reached_by(depth, reach, ahead)
     if depth > _0 and deepest < thickness:
         k = wp.floor(_STEPS * wp.sqrt(depth / deepest) + wp.float64(1e-9))
-        if k >= wp.float64(6.0):
+        if k >= _FEWEST:
             deepest = depth * (_STEPS / k) * (_STEPS / k)
     return wp.max(wp.min(deepest, thickness), wp.max(depth, _SHALLOWEST))
+
+
+@wp.func
+def most_deepest(depth: wp.float64, reach: wp.float64, ahead: wp.float64) -> wp.float64:
+    """``deepest_of`` [m] at most, of a contact that is as deep as that or somewhat deeper."""
+    deepest = reached_by(depth, reach, ahead)
+    k = wp.floor(_STEPS * wp.sqrt(wp.max(depth, _0) / deepest))
+    return wp.where(k < _FEWEST, deepest, deepest * (k + wp.float64(1.0)) * (k + wp.float64(1.0)) / (k * k))
 
 
 @wp.func
@@ -90,14 +104,13 @@ def clear_bins(bins: Bins, block: wp.int32, lane: wp.int32, lanes: wp.int32):
 
 @wp.func
 def add_node(
-    bins: Bins, block: wp.int32, gap: wp.float64, deepest: wp.float64, i: wp.int32, j: wp.int32, nx: wp.int32, ny: wp.int32,
-    flat: wp.float64,
+    sums: wp.array(dtype=Sums), share: wp.float64, i: wp.int32, j: wp.int32, nx: wp.int32, ny: wp.int32, flat: wp.float64
 ):  # fmt: skip
-    """Add node ``i``, ``j`` of a pad's ``nx`` by ``ny`` with a gap at touch in [0, ``deepest`` / 2) [m].
+    """Add node ``i``, ``j`` of a pad's ``nx`` by ``ny`` to the bins of a block; the result does not depend on the order.
 
-    ``flat``: spacing along y over that along x. A node on an edge of the pad stands for half a cell, one in a corner for a quarter.
+    ``share``: its gap at touch over the farthest that counts, in [0, 1). ``flat``: spacing along y over that along x. A node on an edge of
+    the pad stands for half a cell, one in a corner for a quarter.
     """
-    share = _2 * gap / deepest
     k = wp.min(wp.int32(wp.sqrt(share) * _SCALE), _BINS - 1)
     quarters = wp.float64(4.0)
     if i == 0 or i == nx - 1:
@@ -106,7 +119,7 @@ def add_node(
         quarters *= _HALF
     x, y = wp.float64(i), wp.float64(j)
     square = wp.floor((x * x + y * y * flat * flat) * _SQUARE_UNIT + _HALF)
-    wp.atomic_add(bins.sums, block, k, quarters * Sums(_1, x, y, square, wp.floor(share * _GAP_UNIT)))
+    wp.atomic_add(sums, k, quarters * Sums(_1, x, y, square, wp.floor(share * _GAP_UNIT)))
 
 
 @wp.func

@@ -7,40 +7,37 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import warp as wp
 
-from raytac.physics.rigid.placed_kernels import Pads, Placed, under, window
+from raytac.physics.rigid.placed_kernels import Pads, Placed, across, larger, smaller, under, window
 from raytac.physics.rigid.shape_kernels import Shapes, infinity
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _TORUS = wp.constant(wp.int32(7))
 """First of the kinds of parts that may not be convex."""
-NOWHERE = wp.constant(wp.int32(0x3FFFFFFF))
+_MANY = wp.constant(wp.int32(0x7FFFFFFF))
 _0 = wp.constant(wp.float64(0.0))
+_1 = wp.constant(wp.float64(1.0))
 _2 = wp.constant(wp.float64(2.0))
 _HALF = wp.constant(wp.float64(0.5))
 _INF = wp.constant(wp.float64(float("inf")))
 
 
 @wp.func
-def total_of(value: wp.float64) -> wp.float64:
+def total_of(value: Any):
     """Sum over the block; also a barrier."""
+    if wp.block_dim() == 1:  # of a CPU, where a tile takes longer than a node
+        return value
     return wp.tile_sum(wp.tile(value))[0]
 
 
 @wp.func
-def count_of(value: wp.int32) -> wp.int32:
-    return wp.tile_sum(wp.tile(value))[0]
-
-
-@wp.func
-def least_of(value: wp.float64) -> wp.float64:
-    return wp.tile_min(wp.tile(value))[0]
-
-
-@wp.func
-def first_of(value: wp.int32) -> wp.int32:
+def least_of(value: Any):
+    if wp.block_dim() == 1:
+        return value
     return wp.tile_min(wp.tile(value))[0]
 
 
@@ -117,84 +114,145 @@ def between_nodes(
         k += 1
     across = vertex_of(beside[0], middle, beside[1], pads.pitch[level])
     along = vertex_of(beside[2], middle, beside[3], pads.pitch[level])
-    return wp.vec3d(across[0] + along[0], across[1], along[1])
+    return wp.vec3d(across[0] + along[0], beside[1], along[1])
 
 
 @wp.func
-def least_around(
-    gap: wp.array2d(dtype=wp.float64), block: wp.int32, k: wp.int32, i: wp.int32, j: wp.int32, nx: wp.int32, ny: wp.int32,
-    steep: wp.float64,
-) -> wp.vec2d:  # fmt: skip
-    """Lower bound of a convex gap [m] around node k of a window, its i-th along x and its j-th along y; and for how many half spacings
-    around it holds: 1, 2 of a node at the outline of body or window, 4 where a neighbour is beside the body, whose outline may end in a
-    tip that has no node on the next line.
+def look_at_nodes(
+    gap: wp.array(dtype=wp.float64), lines: wp.array(dtype=wp.vec3d), first_x: wp.int32, first_y: wp.int32, lane: wp.int32, nx: wp.int32,
+    ny: wp.int32, bond: wp.float64, below: wp.float64,
+):  # fmt: skip
+    """Turn a thread's heights of a body on ny rows of nx nodes into gaps to the gel, inf of those beneath the bonded face ``bond``; return
+    how many are lower than ``below``, the least and its node, and the lowest height and its node [m]."""
+    count, near_node, low_node = wp.int32(0), wp.int32(_MANY), wp.int32(_MANY)
+    least, low = infinity(), infinity()
+    j = lane // across()
+    while j < ny:
+        rest = lines[first_y + j][1] + _0
+        i = lane % across()
+        while i < nx:
+            k = j * nx + i
+            z = gap[k] + _0
+            if z < bond:
+                z = _INF
+            distance = z - lines[first_x + i][1] - rest
+            if z < low:
+                low = z
+                low_node = k
+            if distance < below:
+                count += 1
+            if distance < least:
+                least = distance
+                near_node = k
+            gap[k] = distance
+            i += across()
+        j += wp.block_dim() // across()
+    return count, least, near_node, low, low_node
 
-    A convex function falls on one side of a node by no more than it rises on the other. ``steep``: fall [m] where both neighbours along
-    an axis are missing.
+
+@wp.func
+def rises_at(gap: wp.array(dtype=wp.float64), k: wp.int32, step: wp.int32, at: wp.int32, count: wp.int32) -> wp.vec2d:
+    """Rises [m] from node k of a window, the ``at``-th on its line of ``count`` nodes that are ``step`` apart, to those before and after;
+    inf where there is none."""
+    before, after = infinity(), infinity()
+    if at > 0:
+        before = gap[k - step] - gap[k]
+    if at < count - 1:
+        after = gap[k + step] - gap[k]
+    return wp.vec2d(before, after)
+
+
+@wp.func
+def fall_along(
+    gap: wp.array(dtype=wp.float64), k: wp.int32, step: wp.int32, at: wp.int32, count: wp.int32, rises: wp.vec2d, steep: wp.float64
+) -> wp.vec2d:  # fmt: skip
+    """Fall [m] of a convex gap within a spacing of node k, at most, by ``rises_at`` it; and for how many spacings around the node this
+    must hold: 0.5, 1 beside the outline of body or window, 2 at the body's outline, which may end in a tip that has no node on the next
+    line.
+
+    A convex function falls on one side of a node by no more than it rises on the other. A neighbour that is higher by more than ``steep``
+    bounds nothing. It counts as one beyond the outline: the node on the other side bounds what is between.
     """
-    middle, fall, around = gap[block, k] + wp.float64(0.0), wp.float64(0.0), wp.float64(1.0)
-    m = wp.int32(0)
-    while m < 2:
-        step, at, count = wp.where(m == 0, 1, nx), wp.where(m == 0, i, j), wp.where(m == 0, nx, ny)
-        rise = -infinity()
-        if at < 2 or at >= count - 2 or gap[block, k - 2 * step] == _INF or gap[block, k + 2 * step] == _INF:
-            around = wp.max(around, _2)
-        if at > 0:
-            if gap[block, k - step] < _INF:
-                rise = gap[block, k - step] - middle
-            else:
-                around = wp.float64(4.0)
-        if at < count - 1:
-            if gap[block, k + step] < _INF:
-                rise = wp.max(rise, gap[block, k + step] - middle)
-            else:
-                around = wp.float64(4.0)
-        if rise == -_INF:
-            rise = steep
-        fall += wp.max(rise, _0)
-        m += 1
-    return wp.vec2d(middle - _HALF * wp.min(around, _2) * fall, around)
+    low, high, around = smaller(rises[0], rises[1]), larger(rises[0], rises[1]), wp.float64(1.0)
+    if at > 1 and at < count - 2:
+        if gap[k - 2 * step] - gap[k - step] <= steep and gap[k + 2 * step] - gap[k + step] <= steep:
+            around = _HALF
+    if high > steep:
+        if at > 0 and at < count - 1 and (high == _INF or low <= steep):
+            around = _2
+        if low <= steep or high == _INF:
+            high = wp.where(low < _INF, low, steep)
+    return wp.vec2d(larger(high, _0), around)
+
+
+@wp.func
+def extent(room: wp.float64, rise: wp.float64, around: wp.float64) -> wp.float64:
+    """How far [spacings] beyond a node, with ``room`` [m] left at it, a convex gap may stay low enough, by its rise to the node before."""
+    if around < _2 and rise < _0:
+        return smaller(around, -room / rise)
+    return around
+
+
+@wp.func
+def nodes_near(gap: wp.array(dtype=wp.float64), lane: wp.int32, nx: wp.int32, ny: wp.int32, below: wp.float64) -> wp.vec4d:
+    """As ``nodes_below`` of any gap, without a bound: where nodes are lower than ``below`` [m] and two nodes more, for an outline may end
+    in a tip that has no node on the next line."""
+    x0, x1, y0, y1 = wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY)
+    j = lane // across()
+    while j < ny:
+        i = lane % across()
+        while i < nx:
+            if gap[j * nx + i] < below:
+                x0, x1, y0, y1 = wp.min(x0, i), wp.min(x1, -i), wp.min(y0, j), wp.min(y1, -j)
+            i += across()
+        j += wp.block_dim() // across()
+    x0, x1, y0, y1 = least_of(x0), -least_of(x1), least_of(y0), -least_of(y1)
+    if x0 == _MANY:
+        return wp.vec4d(_INF, _INF, _INF, _INF)
+    return wp.vec4d(wp.float64(x0), wp.float64(x1), wp.float64(y0), wp.float64(y1)) + wp.vec4d(-_2, _2, -_2, _2)
 
 
 @wp.func
 def nodes_below(
-    gap: wp.array2d(dtype=wp.float64), block: wp.int32, lane: wp.int32, lanes: wp.int32, n: wp.int32, nx: wp.int32, below: wp.float64,
-    steep: wp.float64,
-):  # fmt: skip
-    """Least bound of ``least_around``, and where in a window of n nodes, rows of ``nx``, a convex gap may be at ``below`` or lower [m]:
-    x from, to, y from, to in half spacings from the window's first node; the first is ``NOWHERE`` if it is nowhere."""
-    least = infinity()
-    x0, x1, y0, y1 = wp.int32(NOWHERE), wp.int32(NOWHERE), wp.int32(NOWHERE), wp.int32(NOWHERE)
-    i, j = wp.int32(lane), wp.int32(0)
-    k = wp.int32(lane)
-    while k < n:
-        while i >= nx:
-            i -= nx
-            j += 1
-        if gap[block, k] < _INF:
-            bound = least_around(gap, block, k, i, j, nx, n // nx, steep)
-            least = wp.min(least, bound[0])
-            if bound[0] <= below:
-                around = wp.int32(bound[1]) + 1  # so that the law knows the node after the last that counts
-                x0, x1 = wp.min(x0, 2 * i - around), wp.min(x1, -2 * i - around)
-                y0, y1 = wp.min(y0, 2 * j - around), wp.min(y1, -2 * j - around)
-        i += lanes
-        k += lanes
-    return least_of(least), wp.vec4i(first_of(x0), -first_of(x1), first_of(y0), -first_of(y1))
+    gap: wp.array(dtype=wp.float64), lane: wp.int32, nx: wp.int32, ny: wp.int32, below: wp.float64, steep: wp.float64
+):
+    """Where in a window, ny rows of nx nodes, a convex gap may be at ``below`` or lower [m]: x from, to, y from, to in spacings from the
+    first node, the first inf if it is nowhere. Before it the gap's lower bound [m] where no node is lower than ``below``."""
+    least, x0, x1, y0, y1 = wp.float64(below), infinity(), -infinity(), infinity(), -infinity()
+    j = lane // across()
+    while j < ny:
+        y = wp.float64(j)
+        i = lane % across()
+        while i < nx:
+            k = j * nx + i
+            room = below - gap[k]
+            if room > -_INF:
+                p, q = rises_at(gap, k, 1, i, nx), rises_at(gap, k, nx, j, ny)
+                rise_x, rise_y = larger(p[0], p[1]), larger(q[0], q[1])
+                # A node amid others that are below tells nothing of where they end.
+                if larger(rise_x, rise_y) > room and room + rise_x + rise_y >= _0:
+                    along_x, along_y = fall_along(gap, k, 1, i, nx, p, steep), fall_along(gap, k, nx, j, ny, q, steep)
+                    around = larger(along_x[1], along_y[1])
+                    within = smaller(around, _1)
+                    room_x, room_y = room + within * along_y[0], room + within * along_x[0]
+                    bound = below + room - room_x - room_y
+                    least = smaller(least, bound)
+                    if bound <= below:
+                        x = wp.float64(i)
+                        x0, x1 = smaller(x0, x - extent(room_x, p[1], around)), larger(x1, x + extent(room_x, p[0], around))
+                        y0, y1 = smaller(y0, y - extent(room_y, q[1], around)), larger(y1, y + extent(room_y, q[0], around))
+            i += across()
+        j += wp.block_dim() // across()
+    return least_of(least), wp.vec4d(least_of(x0), -least_of(-x1), least_of(y0), -least_of(-y1))
 
 
 @wp.func
 def box_around(
-    pads: Pads, fx: wp.int32, fy: wp.int32, i0: wp.int32, j0: wp.int32, halves: wp.vec4i, step_x: wp.float64, step_y: wp.float64
+    pads: Pads, fx: wp.int32, fy: wp.int32, i0: wp.int32, j0: wp.int32, box: wp.vec4d, step_x: wp.float64, step_y: wp.float64
 ) -> wp.vec4d:
-    """x from, to, y from, to [m] of half spacings from node ``i0``, ``j0`` of a grid."""
+    """x from, to, y from, to [m] of spacings from node ``i0``, ``j0`` of a grid."""
     x, y = pads.lines[fx][0] + wp.float64(i0) * step_x, pads.lines[fy][0] + wp.float64(j0) * step_y
-    return wp.vec4d(
-        x + _HALF * wp.float64(halves[0]) * step_x,
-        x + _HALF * wp.float64(halves[1]) * step_x,
-        y + _HALF * wp.float64(halves[2]) * step_y,
-        y + _HALF * wp.float64(halves[3]) * step_y,
-    )
+    return wp.vec4d(x + box[0] * step_x, x + box[1] * step_x, y + box[2] * step_y, y + box[3] * step_y)
 
 
 @wp.func

@@ -71,6 +71,12 @@ class Placed:
 
 
 @wp.func
+def across() -> wp.int32:
+    """Threads of a block that are side by side along x."""
+    return wp.min(wp.block_dim(), 32)
+
+
+@wp.func
 def is_finite(pose: wp.mat44d) -> wp.bool:
     total = wp.float64(0.0)
     for i in range(3):
@@ -257,43 +263,55 @@ def entries_of(size: wp.vec3d, rotation: wp.mat33d, at: wp.vec3d):
 
 
 @wp.func
+def larger(a: wp.float64, b: wp.float64) -> wp.float64:
+    """``wp.max`` without its care for NaN, which takes longer than all else at a node."""
+    return wp.where(a > b, a, b)
+
+
+@wp.func
+def smaller(a: wp.float64, b: wp.float64) -> wp.float64:
+    return wp.where(a < b, a, b)
+
+
+@wp.func
 def under_nodes(
-    shapes: Shapes, placed: Placed, block: wp.int32, lane: wp.int32, lanes: wp.int32, lines: wp.array(dtype=wp.vec3d),
-    first_x: wp.int32, first_y: wp.int32, nx: wp.int32, n: wp.int32,
+    shapes: Shapes, placed: Placed, block: wp.int32, lane: wp.int32, lines: wp.array(dtype=wp.vec3d), first_x: wp.int32,
+    first_y: wp.int32, nx: wp.int32, ny: wp.int32,
     # outputs
-    height: wp.array2d(dtype=wp.float64),
+    height: wp.array(dtype=wp.float64),
 ):  # fmt: skip
-    """``under`` on n nodes, rows of ``nx``, each thread its own; the first ones are at ``first_x``, ``first_y`` of ``lines``."""
-    k = wp.int32(lane)
-    while k < n:
-        height[block, k] = _INF
-        k += lanes
+    """``under`` on ny rows of nx nodes, each thread its own; the first ones are at ``first_x``, ``first_y`` of ``lines``."""
+    others = wp.bool(False)
     for m in range(placed.count[block]):
         part = placed.part[block, m]
         if part >= 0:
             c, h = placed.centre[block, m], placed.half[block, m]
             rotation, at = placed.rotation[block, m], placed.at[block, m]
-            kind, size = shapes.kind[part], shapes.size[part]
+            kind, size = wp.int32(shapes.kind[part]), shapes.size[part]
             entry, length = entries_of(size, rotation, at)
-            i, j = wp.int32(lane), wp.int32(0)
-            k = wp.int32(lane)
-            while k < n:
-                while i >= nx:
-                    i -= nx
-                    j += 1
-                x, y = lines[first_x + i][0], lines[first_y + j][0]
-                if wp.abs(x - c[0]) <= h[0] and wp.abs(y - c[1]) <= h[1]:
-                    z = wp.float64(0.0)
-                    if kind == _BOX:
-                        start = entry * wp.vec3d(x, y, _1)
-                        z = wp.max(wp.max(start[0], start[1]), start[2])
-                        if z > wp.min(wp.min(start[0] + length[0], start[1] + length[1]), start[2] + length[2]):
-                            z = _INF
-                    elif kind < _MESH:
-                        z = under_primitive(kind, size, rotation, at, x, y)
-                    else:
-                        z = under_surface(shapes, part, rotation, at, x, y)
-                    if z < height[block, k]:
-                        height[block, k] = z
-                i += lanes
-                k += lanes
+            low, high = c - h, c + h
+            j = lane // across()
+            while j < ny:
+                y = lines[first_y + j][0] + _0
+                over = y >= low[1] and y <= high[1]
+                start = entry * wp.vec3d(_0, y, _1)
+                i = lane % across()
+                while i < nx:
+                    x, k = lines[first_x + i][0] + _0, j * nx + i
+                    z = infinity()
+                    if over and x >= low[0] and x <= high[0]:
+                        if kind == _BOX:
+                            a, b, d = start[0] + entry[0, 0] * x, start[1] + entry[1, 0] * x, start[2] + entry[2, 0] * x
+                            z = larger(larger(a, b), d)
+                            if z > smaller(smaller(a + length[0], b + length[1]), d + length[2]):
+                                z = _INF
+                        elif kind < _MESH:
+                            z = under_primitive(kind, size, rotation, at, x, y)
+                        else:
+                            z = under_surface(shapes, part, rotation, at, x, y)
+                    if others:
+                        z = wp.min(z, height[k])
+                    height[k] = z
+                    i += across()
+                j += wp.block_dim() // across()
+            others = True

@@ -14,24 +14,25 @@ from __future__ import annotations
 import warp as wp
 
 from raytac.physics.rigid.contact_rows import LAST, Rows, missing_row, place_of_gap
-from raytac.physics.rigid.law_kernels import DEEPER, Bins, add_node, clear_bins, deepest_of, tabulate
+from raytac.physics.rigid.law_kernels import DEEPER, Bins, add_node, clear_bins, deepest_of, most_deepest, tabulate
 from raytac.physics.rigid.node_kernels import (
-    NOWHERE,
     between_nodes,
     box_around,
-    count_of,
-    first_of,
     is_convex,
     least_of,
+    look_at_nodes,
     nodes_below,
+    nodes_near,
     pierced_at,
     total_of,
 )
 from raytac.physics.rigid.placed_kernels import (
     Pads,
     Placed,
+    across,
     bottom_of,
     is_finite,
+    larger,
     lowest_of,
     place_parts,
     under_nodes,
@@ -61,6 +62,7 @@ _CLOSE = wp.constant(wp.float64(1e-6))
 _JUST_TOUCHING = wp.constant(wp.float64(50e-6))
 """The place of a gap is the centroid of the overlap that the body would have so much deeper [m]."""
 _0 = wp.constant(wp.float64(0.0))
+_1 = wp.constant(wp.float64(1.0))
 _2 = wp.constant(wp.float64(2.0))
 _HALF = wp.constant(wp.float64(0.5))
 _INF = wp.constant(wp.float64(float("inf")))
@@ -112,7 +114,7 @@ def measure_pair(
     pad: wp.int32, body: wp.int32, row: wp.int32, rows: Rows,
 ):  # fmt: skip
     """Fill one row."""
-    placed = work.placed
+    placed, gaps = work.placed, work.gap[block]
     place_parts(shapes, pads, placed, block, lane, lanes, pose, pad, body, reach)
     total_of(_0)
     bond, thickness, highest = -pads.thickness[pad], pads.thickness[pad], pads.highest[pad]
@@ -135,10 +137,10 @@ def measure_pair(
     everywhere = wp.vec4d(-_INF, _INF, -_INF, _INF)  # x from, to, y from, to
     outer, box = wp.vec4d(everywhere), wp.vec4d(everywhere)  # where the gap may be below ``clear``; where nodes are looked at
     zero = wp.float64(0.0)  # gap below which nodes count
-    lowest_before = infinity()  # of the body, on coarser grids
+    low, low_level, low_i, low_j = infinity(), wp.int32(0), wp.int32(0), wp.int32(0)  # lowest node of the body, on any grid
     depth, deepest, least = wp.float64(0.0), wp.float64(0.0), infinity()
     refined_x, refined_y = wp.float64(0.0), wp.float64(0.0)
-    i0, j0, nx, n = wp.int32(0), wp.int32(0), wp.int32(1), wp.int32(0)
+    i0, j0, nx, ny = wp.int32(0), wp.int32(0), wp.int32(0), wp.int32(0)
     fx, fy = wp.int32(0), wp.int32(0)
     may_zoom, busy = wp.int32(1), wp.int32(1)
     while busy == 1:
@@ -152,129 +154,94 @@ def measure_pair(
         x0, y0 = pads.lines[fx][0], pads.lines[fy][0]
         i0, j0 = area[0], area[2]
         i1, j1 = area[1], area[3]
-        if box[0] > -_INF:
-            i0 = wp.max(i0, wp.int32(wp.ceil((box[0] - x0) / step_x)))
-            i1 = wp.min(i1, wp.int32(wp.floor((box[1] - x0) / step_x)) + 1)
-            j0 = wp.max(j0, wp.int32(wp.ceil((box[2] - y0) / step_y)))
-            j1 = wp.min(j1, wp.int32(wp.floor((box[3] - y0) / step_y)) + 1)
-        nx = wp.max(i1 - i0, 0)
-        n = nx * wp.max(j1 - j0, 0)
-        if level < last and n < _ENOUGH:  # so few cannot be enough
+        if box[0] > -_INF:  # and one node beyond, for the law to know the node after the last that counts
+            i0 = wp.max(i0, wp.int32(wp.floor((box[0] - x0) / step_x)))
+            i1 = wp.min(i1, wp.int32(wp.ceil((box[1] - x0) / step_x)) + 1)
+            j0 = wp.max(j0, wp.int32(wp.floor((box[2] - y0) / step_y)))
+            j1 = wp.min(j1, wp.int32(wp.ceil((box[3] - y0) / step_y)) + 1)
+        nx, ny = wp.max(i1 - i0, 0), wp.max(j1 - j0, 0)
+        if level < last and nx * ny < _ENOUGH and not (mode == _ZOOM and convex):  # so few cannot be enough
             level += 1
             continue
-        if n > work.gap.shape[1]:  # narrow bodies are looked at on finer grids as far as the memory goes
+        if nx * ny > work.gap.shape[1]:  # narrow bodies are looked at on finer grids as far as the memory goes
             level -= 1
             last = wp.int32(level)
             continue
-        keep = _NEAR * pitch + clear
-        count, near_node, low_node = wp.int32(0), wp.int32(_MANY), wp.int32(_MANY)
-        own_least, own_low = infinity(), infinity()
-        a0, a1, b0, b1 = wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY)
-        under_nodes(shapes, placed, block, lane, lanes, pads.lines, fx + i0, fy + j0, nx, n, work.gap)
-        i, j = i0 + lane, wp.int32(j0)
-        k = wp.int32(lane)
-        while k < n:
-            while i >= i0 + nx:
-                i -= nx
-                j += 1
-            z = work.gap[block, k]
-            gap = infinity()
-            if z >= bond and z < _INF:
-                gap = z - pads.lines[fx + i][1] - pads.lines[fy + j][1]
-                if z < own_low:
-                    own_low = z
-                    low_node = k
-                if gap < zero:
-                    count += 1
-                if gap < own_least:
-                    own_least = gap
-                    near_node = k
-                if gap < keep:
-                    a0, a1, b0, b1 = wp.min(a0, i), wp.min(a1, -i), wp.min(b0, j), wp.min(b1, -j)
-            work.gap[block, k] = gap
-            i += lanes
-            k += lanes
-        count = count_of(count)
+        under_nodes(shapes, placed, block, lane, pads.lines, fx + i0, fy + j0, nx, ny, gaps)
+        count, own_least, near_node, own_low, low_node = look_at_nodes(
+            gaps, pads.lines, fx + i0, fy + j0, lane, nx, ny, bond, zero
+        )
+        count = total_of(count)
         if mode == _LAW:
             if (count >= _ENOUGH and level >= _FIRST) or level >= last:
                 busy = 0
             elif convex and count > 0:
-                bound, halves = nodes_below(work.gap, block, lane, lanes, n, nx, zero, _NEAR * pitch)
-                box = box_around(pads, fx, fy, i0, j0, halves, step_x, step_y)
+                bound, around = nodes_below(gaps, lane, nx, ny, zero, _NEAR * pitch)
+                box = box_around(pads, fx, fy, i0, j0, around, step_x, step_y)
             level += 1
             continue
-        least = least_of(own_least)
-        near_node = first_of(wp.where(own_least == least, near_node, _MANY))
-        low = least_of(own_low)
-        low_node = first_of(wp.where(own_low == low, low_node, _MANY))
-        a0, a1, b0, b1 = first_of(a0), -first_of(a1), first_of(b0), -first_of(b1)
         if mode == _ZOOM and count > 0:  # it does touch, between the nodes that were looked at
             mode, may_zoom = wp.int32(_SEARCH), wp.int32(0)
             box = wp.vec4d(outer)
             continue
+        lower = least_of(own_low)
+        if lower < low:
+            low_node = least_of(wp.where(own_low == lower, low_node, _MANY))
+            low, low_level, low_i, low_j = lower, wp.int32(level), i0 + low_node % nx, j0 + low_node // nx
+        least = least_of(own_least)
         i, j = wp.int32(0), wp.int32(0)  # of the least gap
         if least < _INF:
-            j = near_node // nx
-            i = i0 + near_node - j * nx
-            j += j0
+            near_node = least_of(wp.where(own_least == least, near_node, _MANY))
+            i, j = near_node % nx, near_node // nx
         done = level >= last or (count >= _ENOUGH and level >= _FIRST)
         beyond = wp.bool(False)
         if not done and wide and convex:
             # Where the gap may be below what the law counts, and where it may be least.
-            counted = wp.max(deeper, _HALF * deepest_of(-least, reach, work.ahead, thickness) + least)
-            bound, halves = nodes_below(work.gap, block, lane, lanes, n, nx, counted, _NEAR * pitch)
-            if halves[0] < NOWHERE and mode == _SEARCH:
-                outer = box_around(pads, fx, fy, i0, j0, halves, step_x, step_y)
-                box = wp.vec4d(outer)
-            beyond = bound >= reach and count == 0
-            done = beyond or (level >= _FIRST and count == 0 and least - bound < _CLOSE)
-            if not done and count == 0 and may_zoom == 1:
-                mode = wp.int32(_ZOOM)
-                bound, halves = nodes_below(work.gap, block, lane, lanes, n, nx, least, _NEAR * pitch)
-                box = box_around(pads, fx, fy, i0, j0, halves, step_x, step_y)
+            counted = wp.max(deeper, _HALF * most_deepest(-least, reach, work.ahead) + least)
+            if mode == _SEARCH:
+                bound, around = nodes_below(gaps, lane, nx, ny, counted, _NEAR * pitch)
+                if around[0] < _INF:
+                    outer = box_around(pads, fx, fy, i0, j0, around, step_x, step_y)
+                    box = wp.vec4d(outer)
+            if count == 0:
+                bound, around = nodes_below(gaps, lane, nx, ny, least, _NEAR * pitch)
+                beyond = bound >= reach
+                done = beyond or (level >= _FIRST and least - bound < _CLOSE)
+                if not done and may_zoom == 1:
+                    mode = wp.int32(_ZOOM)
+                    box = box_around(pads, fx, fy, i0, j0, around, step_x, step_y)
         elif not done and wide and least >= near:
             beyond = least >= reach + near
             done = beyond
             if not done and may_zoom == 1:
                 mode = wp.int32(_ZOOM)
-                box = box_around(pads, fx, fy, i, j, wp.vec4i(-2, 2, -2, 2), step_x, step_y)
+                box = box_around(pads, fx, fy, i0 + i, j0 + j, wp.vec4d(-_1, _1, -_1, _1), step_x, step_y)
         if not done:
-            following = level + 1
-            if low < _INF:
-                q = low_node // nx
-                p = i0 + low_node - q * nx
-                q += j0
-                lowest_before = wp.min(
-                    lowest_before, low - between_nodes(shapes, pads, placed, block, pad, level, p, q, low, 0)[0]
-                )
+            level += 1
             if mode != _ZOOM:
                 # With half the spacing there are four times as many nodes: a grid with fewer than half of enough is left out.
                 expected = 4 * count
-                while following < wp.min(last, _LAST) and expected < _ENOUGH // 2:
-                    following += 1
+                while level < wp.min(last, _LAST) and expected < _ENOUGH // 2:
+                    level += 1
                     expected *= 4
-                if wide and not convex and width[1] == _INF and a0 < _MANY:
-                    # Two nodes more: an outline may end in a tip that has no node on the next line.
-                    box = box_around(pads, fx, fy, a0, b0, wp.vec4i(-4, 2 * (a1 - a0) + 4, -4, 2 * (b1 - b0) + 4), step_x, step_y)
-                    outer = wp.vec4d(box)
-            level = following
+                if wide and not convex and width[1] == _INF:
+                    around = nodes_near(gaps, lane, nx, ny, _NEAR * pitch + clear)
+                    if around[0] < _INF:
+                        outer = box_around(pads, fx, fy, i0, j0, around, step_x, step_y)
+                        box = wp.vec4d(outer)
             continue
         busy = 0
         # The body's lowest point, and its least gap, between the nodes.
         if not pierced and low < _INF:
-            q = low_node // nx
-            p = i0 + low_node - q * nx
-            q += j0
-            lowest = wp.max(
-                wp.min(low - between_nodes(shapes, pads, placed, block, pad, level, p, q, low, 0)[0], lowest_before), bond
-            )
+            drop = between_nodes(shapes, pads, placed, block, pad, low_level, low_i, low_j, low, 0)
+            lowest = wp.max(low - drop[0], bond)
         if beyond or least == _INF:
             least = _INF
             continue
-        drop = between_nodes(shapes, pads, placed, block, pad, level, i, j, least, 1)
+        drop = between_nodes(shapes, pads, placed, block, pad, level, i0 + i, j0 + j, least, 1)
         depth = drop[0] - least
-        refined_x = pads.lines[fx + i][0] + drop[1] * step_x
-        refined_y = pads.lines[fy + j][0] + drop[2] * step_y
+        refined_x = pads.lines[fx + i0 + i][0] + drop[1] * step_x
+        refined_y = pads.lines[fy + j0 + j][0] + drop[2] * step_y
         deepest = deepest_of(depth, reach, work.ahead, thickness)
         if least < _0:
             touching = 1
@@ -298,44 +265,43 @@ def measure_pair(
     shift = wp.float64(0.0)
     if touching == 0:
         shift = wp.min(_HALF * deepest, _JUST_TOUCHING) - depth
-    s, sx, sy, sz, szz, slope_x, slope_y = (
-        wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0),
-    )  # fmt: skip
-    # Of the overlap's area: number of nodes, first and second moments.
-    n1, nx1, ny1, nxx, nxy, nyy = (
-        wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0),
-    )  # fmt: skip
+    s, szz, su, sv = wp.float64(0.0), wp.float64(0.0), wp.vec3d(), wp.vec3d()
+    first, second = wp.vec3d(), wp.vec3d()  # number of nodes and first moments, second moments of the overlap's area
     clear_bins(work.bins, block, lane, lanes)
     total_of(_0)
     nodes_x, nodes_y = wp.int32(pads.nx[pad, level]), wp.int32(pads.ny[pad, level])
-    flat = (pads.lines[fy + 1][0] - pads.lines[fy][0]) / (pads.lines[fx + 1][0] - pads.lines[fx][0])
-    k = wp.int32(lane)
-    while k < n:
-        gap = work.gap[block, k]
-        if gap < _INF:
+    flat, farthest = step_y / step_x, _HALF * deepest
+    inverse, sums = _1 / farthest, work.bins.sums[block]
+    j = lane // across()
+    while j < ny:
+        v = pads.lines[fy + j0 + j] + wp.vec3d()
+        row_s, row_n, row_x, row_xx = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+        i = lane % across()
+        while i < nx:
+            gap = gaps[j * nx + i] + _0
             overlap = shift - gap
-            j = k // nx
             if overlap > _0:
-                u, v = pads.lines[fx + i0 + k - j * nx], pads.lines[fy + j0 + j]
-                s += overlap
-                sx += overlap * u[0]
-                sy += overlap * v[0]
-                sz += overlap * (u[1] + v[1])
+                u = pads.lines[fx + i0 + i] + wp.vec3d()
+                row_s += overlap
                 szz += overlap * overlap
-                slope_x += overlap * u[2]
-                slope_y += overlap * v[2]
-                n1 += wp.float64(1.0)
-                nx1 += u[0]
-                ny1 += v[0]
-                nxx += u[0] * u[0]
-                nxy += u[0] * v[0]
-                nyy += v[0] * v[0]
-            if _2 * (gap + depth) < deepest:
-                add_node(work.bins, block, wp.max(gap + depth, _0), deepest, i0 + k - j * nx, j0 + j, nodes_x, nodes_y, flat)
-        k += lanes
-    s, sx, sy, sz, szz = total_of(s), total_of(sx), total_of(sy), total_of(sz), total_of(szz)
-    slope_x, slope_y = total_of(slope_x), total_of(slope_y)
-    n1, nx1, ny1, nxx, nxy, nyy = total_of(n1), total_of(nx1), total_of(ny1), total_of(nxx), total_of(nxy), total_of(nyy)
+                su += overlap * u
+                row_n += wp.float64(1.0)
+                row_x += u[0]
+                row_xx += u[0] * u[0]
+            at_touch = larger(gap + depth, _0)
+            if at_touch < farthest:
+                add_node(sums, at_touch * inverse, i0 + i, j0 + j, nodes_x, nodes_y, flat)
+            i += across()
+        s += row_s
+        sv += row_s * v
+        first += wp.vec3d(row_n, row_x, row_n * v[0])
+        second += wp.vec3d(row_xx, row_x * v[0], row_n * v[0] * v[0])
+        j += wp.block_dim() // across()
+    s, szz = total_of(s), total_of(szz)
+    sx, sz, slope_x = total_of(su[0]), total_of(su[1] + sv[1]), total_of(su[2])
+    sy, slope_y = total_of(sv[0]), total_of(sv[2])
+    n1, nx1, ny1 = total_of(first[0]), total_of(first[1]), total_of(first[2])
+    nxx, nxy, nyy = total_of(second[0]), total_of(second[1]), total_of(second[2])
     if lane == 0:
         rows.valid[row] = 1
         rows.depth[row] = depth

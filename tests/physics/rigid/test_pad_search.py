@@ -409,9 +409,8 @@ def test_a_convex_body_is_measured_as_any_other(kind: str, gelpad: GelpadSpec) -
         np.testing.assert_array_equal(getattr(one, name)[touches], getattr(two, name)[touches], err_msg=name)
     np.testing.assert_allclose(one.depth, two.depth, atol=1e-6)  # of a gap by parabolas on a coarser grid
     np.testing.assert_allclose(one.centre, two.centre, atol=5e-6)
-    for name in ("force", "radius"):  # of the last entries, half a node may count beyond the box
+    for name in ("force", "radius"):  # also at the last entries, which the nodes at the box's edges decide
         these, those = getattr(one, name)[touches], getattr(two, name)[touches]
-        np.testing.assert_allclose(these[:, :-3], those[:, :-3], rtol=1e-4, atol=1e-9, err_msg=name)
-        np.testing.assert_allclose(these, those, rtol=5e-3, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(these, those, rtol=1e-4, atol=1e-9, err_msg=name)
     lowest = (under - (least + shift)[:, None, None]).min(axis=(1, 2))[one.env]
     np.testing.assert_allclose(one.clearance, gelpad.thickness + lowest, atol=60e-6)
