@@ -41,10 +41,7 @@ class ImplicitDamping:
         self._mass.clear()
 
     def add(self, env: int, model: mujoco.MjModel, data: mujoco.MjData, step: float) -> None:
-        """Add the damping of a step [s] to the mass matrix, after ``mj_step1`` and before constraints are made.
-
-        The damping is that of the last step: only how much of it is implicit depends on that.
-        """
+        """Add the damping of a step [s] to the mass matrix, after ``mj_fwdActuation`` and before constraints are made."""
         self._mass[env] = data.M.copy()
         data.M[:] += step * self._damping(model, data)
         mujoco.mj_factorM(model, data)
@@ -74,9 +71,8 @@ class ImplicitDamping:
             result = np.zeros_like(data.M)
             result[self._diagonal] = self._of_joints
             return result
-        if not data.qDeriv.any():  # no step so far
-            if data is not self._scratch:
-                mujoco.mj_copyData(self._scratch, model, data)
-            mujoco.mj_implicit(model, self._scratch)
-            data.qDeriv[:] = self._scratch.qDeriv
-        return -data.qDeriv[self._of_mass]
+        # MuJoCo finds it in the integrator alone. A servo whose force is cut at its bound has none.
+        if data is not self._scratch:
+            mujoco.mj_copyData(self._scratch, model, data)
+        mujoco.mj_implicit(model, self._scratch)
+        return -self._scratch.qDeriv[self._of_mass]
