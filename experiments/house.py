@@ -3,8 +3,8 @@
     python experiments/house.py --out runs/house
 
 Counts over ``raytac`` and ``ipc``: lines, files, circles of imports (imports inside functions and for types count), files of at most 130
-lines that one module imports, docstrings that begin with a question word, names that the word list of the glossary replaces, and files
-that a user's optical mode consists of.
+lines that one module imports, docstrings that begin with a question word or whose first line is longer than 90 characters, names that
+the word list of the glossary replaces, and files that a user's optical mode consists of.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pathlib import Path
 PACKAGES = ("raytac", "ipc")
 SMALL_FILE = 130
 LONG_FILE = 400
+LONG_LINE = 90
 EXAMPLE = Path("examples", "own_optical_mode.py")
 OTHER_MODES = {"raytrace", "taxim", "phong", "mlp"}
 QUESTION = re.compile(r"(What|Whether|How|Where|Which|Who)\b")
@@ -163,6 +164,12 @@ def measure(root: Path) -> tuple[dict[str, int], dict[str, list[str]]]:
         ],
         "docstrings_wh": [
             f"{name}: {text.splitlines()[0]}" for name, tree in trees.items() for text in docstrings(tree) if QUESTION.match(text)
+        ],
+        "docstrings_long": [
+            f"{name}: {text.splitlines()[0]}"
+            for name, tree in trees.items()
+            for text in docstrings(tree)
+            if len(text.split("\n", 1)[0]) > LONG_LINE
         ],
         "words": [f"{name}: {word}" for name, tree in trees.items() for word in names_bound(tree) if word.strip("_") in WORDS],
     }

@@ -6,7 +6,6 @@ Warp runs one thread after the other, one thread adds everything.
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
-# (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 

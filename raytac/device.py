@@ -30,13 +30,13 @@ DEVICES = ("auto", "cpu", "cuda")
 """Names that every ``device`` option accepts."""
 
 CUDA_MINIMUM = (12, 2)
-"""Oldest CUDA that Dr.Jit 1.5 takes: it switches its CUDA backend off below, and says so in its log only."""
+"""Oldest CUDA that Dr.Jit 1.5 takes; below, it silently switches its CUDA backend off."""
 CUDA_REFUSED = (12, 7)
 """CUDA whose OptiX Dr.Jit 1.5 refuses."""
 LLVM_NAMED_BY_USER = bool(os.environ.get("DRJIT_LIBLLVM_PATH"))
 """True if the environment named a libLLVM before raytac started; else ``raytac.optics``, which imports this first, names one."""
 LLVM_MINIMUM = 16
-"""Oldest LLVM looked for on the system: 14 is refused by Dr.Jit 1.5, and 15 was seen to abort the process."""
+"""Oldest LLVM looked for: Dr.Jit 1.5 refuses 14, and 15 was seen to abort the process."""
 
 
 def resolve_device(device: str = "auto", *, ray_tracing: bool = True) -> str:

@@ -23,7 +23,7 @@ __all__ = [
 _LONGEST_MESSAGE = 2000
 """Characters of a message; the middle of a longer one is left out."""
 _LONGEST_PATH = 400
-"""Characters of a path in a message; the start of a longer one is left out, since its end names the file."""
+"""Characters of a path in a message; of a longer one the end is shown."""
 _DEEPEST = 8
 """Nested containers that a message shows."""
 _MOST_CHOICES = 60

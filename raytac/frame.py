@@ -58,24 +58,24 @@ class TactileFrame:
     rgb: np.ndarray
     """8-bit image after the camera response, shape (B, H, W, 3), uint8."""
     layers: dict[str, np.ndarray]
-    """Linear radiance by light layer, each shape (B, H, W, 3), float32; their sum is the linear image."""
+    """Linear radiance by light layer, each (B, H, W, 3), float32; the sum is the image."""
     normals: np.ndarray
-    """Unit normal of the coat towards the camera side (n_z < 0), pad frame, shape (B, H, W, 3), float32."""
+    """Unit normal of the coat towards the camera (n_z < 0), pad frame, (B, H, W, 3), float32."""
     position: np.ndarray
-    """Seen point of the coat, pad frame [m], shape (B, H, W, 3), float32 (comes with ``normals``)."""
+    """Seen point of the coat, pad frame [m], (B, H, W, 3), float32 (comes with ``normals``)."""
     depth: np.ndarray
     """Camera-axis depth z − z_camera [m], shape (B, H, W), float32 (not distance along the ray)."""
     height: np.ndarray
     """Surface height on the pad grid [m], shape (B, Ny, Nx), float32."""
     contact: np.ndarray
-    """Contact mask as the camera sees it, shape (B, H, W), bool (comes with ``normals`` or ``depth``)."""
+    """Contact mask seen by the camera, (B, H, W), bool (comes with ``normals`` or ``depth``)."""
     uncovered: np.ndarray
     """Share of the contact's pixels whose bin of the Taxim table no calibration sample reached, shape (B,), NaN without contact;
     of the mode ``taxim`` alone, where the table tells its coverage."""
     markers: MarkerFrame
     """Positions of the markers, in metres and pixels; present if the sensor has a marker model."""
     wrench: np.ndarray
-    """Force of the object on the pad [N] and its torque about the pad frame's origin [N m], pad frame, shape (B, 6)."""
+    """Force on the pad [N] and torque about the pad frame's origin [N m], pad frame, (B, 6)."""
     traction: np.ndarray
     """Force of the object on the pad per area [Pa], pad frame, on the pad grid, shape (B, Ny, Nx, 3), float32: x, y shear, −z pressure.
     Of a soft pad at the place that the coat has at rest; of the rigid pad its force shared out over the contact (a model). Its sum
@@ -96,10 +96,10 @@ class TactileFrame:
     """Steps of a soft pad's solver that did not meet its tolerance since the press began, or since the world's environment was reset,
     shape (B,), int. An environment whose last step is one of them has ``failed``."""
     time_ms: dict[str, float]
-    """Wall time of ``physics``, ``surface``, ``markers`` and ``optics`` for the whole batch [ms]."""
+    """Wall time of ``physics``, ``surface``, ``markers``, ``optics`` for the batch [ms]."""
 
     label: str
-    """Physics and optics that it came from, as ``TactileSensor.label``; empty if it is not known."""
+    """Physics and optics that it came from, as ``TactileSensor.label``; empty if unknown."""
 
     def __init__(self, surface: GelSurface, **values: Any) -> None:
         """``values``: further fields; None is as if it were not given."""

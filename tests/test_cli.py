@@ -12,9 +12,7 @@ import pytest
 
 import raytac
 from raytac.cli import main
-from raytac.errors import BackendError
 from raytac.io.metrics import read_metrics
-from raytac.sensor import TactileSensor
 
 TOUCH = """
 [object]
@@ -68,29 +66,6 @@ def test_wrong_input_is_one_line_and_writes_nothing(
     for word in words:
         assert word in told.err
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    "args", [["press", "sphere", "--physics", "ipc"], ["press", "sphere", "--level", "coarse"], ["calibrate", "markers"]]
-)
-def test_without_the_solver_one_line_says_what_to_install(
-    args: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name in [name for name in sys.modules if name == "warp" or name.startswith("ipc.")]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "warp", None)  # as if it were not installed
-    assert main(args) == 2
-    told = capsys.readouterr()
-    assert told.out == "" and told.err.startswith("raytac: error: ") and told.err.count("\n") == 1
-    assert 'pip install "raytac[ipc]"' in told.err and "Warp" in told.err
-    assert not list(tmp_path.iterdir())
-
-
-def test_without_the_solver_a_sensor_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "warp", None)
-    with pytest.raises(BackendError, match=r'pip install "raytac\[ipc\]"'):
-        TactileSensor(physics="ipc", outputs="height", device="cpu").load("sphere")
 
 
 @pytest.mark.parametrize("verbose", [False, True])

@@ -13,7 +13,8 @@ from raytac.io.metrics import read_metrics
 FILES = {
     "raytac/__init__.py": "",
     "raytac/a.py": '"""What it is."""\nfrom raytac import b\n\nfound = left_side = 1\n\n\ndef way(told):\n    """Result of a search."""\n',
-    "raytac/b.py": "from . import c\n\nheight = 1\n'''Where it lies [m].'''\n",
+    "raytac/b.py": "from . import c\n\nheight = 1\n'''Where it lies [m].'''\n"
+    f"width = 1\n'''{90 * 'x'}'''\nlength = 1\n'''{91 * 'x'}\n{99 * 'x'}'''\n",
     "raytac/c.py": "def f():\n    from raytac.a import found\n    return found\n",
     "raytac/deep/__init__.py": "",
     "raytac/deep/one.py": "from ..deep.two import x\nfrom ..a import way\n",
@@ -46,6 +47,7 @@ def test_counts_of_a_known_package(root: Path) -> None:
         "circles": 2,
         "single_importer_small_files": 4,
         "docstrings_wh": 3,
+        "docstrings_long": 1,
         "words": 4,
     }
     assert details["circles"] == ["raytac.a <-> raytac.b <-> raytac.c", "raytac.deep.one <-> raytac.deep.two"]
@@ -56,6 +58,7 @@ def test_counts_of_a_known_package(root: Path) -> None:
         "raytac.deep.two",
     ]
     assert details["docstrings_wh"] == ["ipc.alone: Whether it is held.", "raytac.a: What it is.", "raytac.b: Where it lies [m]."]
+    assert details["docstrings_long"] == [f"raytac.b: {91 * 'x'}"]
     assert sorted(details["words"]) == ["ipc.alone: held", "raytac.a: found", "raytac.a: told", "raytac.a: way"]
 
 

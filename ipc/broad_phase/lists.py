@@ -10,7 +10,6 @@ for a pad and a tool is a few hundred against a few hundred. :mod:`ipc.broad_pha
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
-# (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 

@@ -11,7 +11,6 @@ there is tested again in double precision, which makes the pairs the same as tho
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
-# (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 

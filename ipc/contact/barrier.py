@@ -8,7 +8,6 @@ so that κ is a pressure [Pa] (Li et al. 2023, "Convergent Incremental Potential
 """
 
 # pyright: reportReturnType=false
-# (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Buffers of contacts and of the rows of their Hessian; counts may exceed what fits."""
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportGeneralTypeIssues=false, reportInvalidTypeForm=false
-# (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 

@@ -5,7 +5,6 @@ theorem), so ∂D/∂x_i = 2 c_i t for D = ‖t‖², whichever features are clo
 """
 
 # pyright: reportIndexIssue=false, reportOperatorIssue=false
-# (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 

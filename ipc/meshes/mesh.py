@@ -48,7 +48,7 @@ class TriMesh:
 
 
 def _check_arrays(mesh: TetMesh | TriMesh, cells: Literal["tets", "faces"], corners: int) -> None:
-    """Make a mesh's arrays contiguous float64 and int32; refuse shapes and indices that are wrong."""
+    """Make a mesh's arrays contiguous float64 and int32; refuse wrong shapes and indices."""
     vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
     indices = np.ascontiguousarray(getattr(mesh, cells), dtype=np.int32)
     object.__setattr__(mesh, "vertices", vertices)

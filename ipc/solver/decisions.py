@@ -5,7 +5,6 @@ Flags of one element say whether any environment needs a branch; they are the co
 """
 
 # pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false
-# (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 

@@ -6,7 +6,6 @@ in frame coordinates with ỹ = Rᵀ(x̃ − t): there are no fictitious forces,
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
-# (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 

@@ -4,7 +4,6 @@ Nodes are unknowns, in the frame of their body; vertices are surface points, in 
 """
 
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportInvalidTypeForm=false
-# (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 

@@ -7,7 +7,6 @@ a CPU, go to :mod:`ipc.solver.pcg_block`.
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
 # pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
-# (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 

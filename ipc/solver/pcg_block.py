@@ -7,7 +7,6 @@ thread, which does everything in order: Warp's own conjugate gradients take 10 m
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
 # pyright: reportInvalidTypeForm=false
-# (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """The state of a step: the decisions of each environment, and flags made from them."""
 
 # pyright: reportInvalidTypeForm=false
-# (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from raytac.errors import InputError
 from raytac.gel.interpolate import sampled
 
 DOUBTFUL = 5.0
-"""Score [levels] below which a circle is no more than a guess: some three times the noise of a Mini's pixel."""
+"""Score [levels] below which a circle is a guess: three times the noise of a Mini's pixel."""
 _REACH = 0.08
 """δ over the circle's radius."""
 _ANGLES = 96

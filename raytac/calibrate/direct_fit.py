@@ -75,7 +75,7 @@ class FitSettings:
     fixed: tuple[str, ...] = ()
     """Blocks of parameters that stay: names of ``SIGMA``."""
     prior: float = 30.0
-    """Squared residual [levels²] that a parameter's deviation of one sigma from its start is worth."""
+    """Squared residual [levels²] that is worth one sigma of a parameter's deviation."""
     ties: float = 0.0
     """The same of a deviation from ``side_ties``: LEDs of a side alike and mirrored."""
 

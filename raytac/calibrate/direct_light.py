@@ -18,9 +18,9 @@ from raytac.calibrate.imprint import PixelGeometry
 from raytac.optics.trace.led import lobe_gain, lobe_slopes
 
 _BEHIND = 1e-3
-"""Least cosine of an LED's lobe: keeps a power of it differentiable behind the LED, where it is next to nothing."""
+"""Least cosine of an LED's lobe: its powers stay differentiable behind the LED."""
 _SOFT = 1e-2
-"""Softness of the terminator: cosine over which a coat that turns away from an LED goes dark."""
+"""Cosine over which a coat that turns away from an LED goes dark."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class ExtraLight:
     at: np.ndarray
     """(L, 7), rows as those of ``LightParameters.leds``."""
     by_led: Mapping[int, Light]
-    """Slope of every LED's light by a column of its row; columns that are not named change nothing."""
+    """Slope of every LED's light by a column of its row; other columns change nothing."""
 
     def of(self, leds: np.ndarray) -> Light:
         """The light of LEDs (L, 7)."""

@@ -69,7 +69,7 @@ class ShadingSettings:
     degree: int = 6
     """Degree of the polynomial: at 6 it has 28 coefficients a channel."""
     ridge: float = 1e-5
-    """Ridge of the least squares: far below a level of the image, except where a photograph is dark."""
+    """Ridge of the least squares: far below a level, except where a photograph is dark."""
     pitch: float = 0.12e-3
     """Spacing of the pad's nodes [m]; the pad is smooth."""
 

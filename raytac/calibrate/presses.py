@@ -39,7 +39,7 @@ class RealPresses:
     ball_radius: np.ndarray
     """Radius of each press's ball [m], (N,)."""
     circles: np.ndarray
-    """Contact circle of each press: x and y of its centre, radius [px], (N, 3); NaN where the data set has none."""
+    """Contact circle of each press: centre x, y and radius [px], (N, 3); NaN without one."""
     names: tuple[str, ...]
     """Name of each press, for messages and figures."""
 

@@ -31,10 +31,10 @@ STRENGTHS: dict[str, dict[str, float]] = {
 }
 """Values of ``FitSettings`` by name: whether LEDs of a side are tied to each other, and how much the brightness at rest is believed."""
 CHOICES = {name: values for name, values in STRENGTHS.items() if values["ties"]}
-"""Candidates of the choice. LEDs of a side are always taken to be alike, as sensors are built so."""
+"""Candidates of the choice. LEDs of a side are alike, as sensors are built so."""
 USUAL = "tied-dark"
 SAMPLES = (90, 45)
-"""Pixels of a press that count here, inside and outside its circle: the choice needs fewer than the fit."""
+"""Pixels of a press that count, inside and outside its circle: fewer than in the fit."""
 STEPS, CIRCLE_STEPS = 40, 6
 """Most steps of a fit, and of that of the tested presses' circles."""
 

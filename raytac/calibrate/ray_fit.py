@@ -28,9 +28,9 @@ from raytac.specs import SensorSpec
 GRID_PITCH = 0.12e-3
 """Spacing of the pad's nodes [m] while fitting."""
 FACTOR = 2
-"""Presses are fitted as means of so many pixels squared, which is also what the ray tracer renders."""
+"""Presses are fitted, and rendered, as means of so many pixels squared."""
 FIRST, LATER = 100, 30
-"""Most steps of the solver with direct light alone, and in every round with the ray tracer's."""
+"""Most solver steps with direct light alone, and in each round with the ray tracer's."""
 START_SPREAD = np.array([1.5, 1.5, 1.0, 0.2, 0.2, 0.5, 0.0])
 """Standard deviation of the starts: mm, rad, lobe exponent, mm."""
 STEPS = {0: 0.4, 1: 0.4, 2: 0.4, HEIGHT: 0.5}

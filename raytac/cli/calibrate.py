@@ -57,7 +57,7 @@ class CalibrateArgs(FitOptions, SolverOptions):
         if self.what != "markers":
             return self._optics(start)
         sensor = load_sensor(self.sensor)
-        self.prepare_solver("calibrate markers")
+        self.prepare_solver()
         out = self.folder("calibrate", "markers", sensor.name + ("-quick" if self.quick else ""))
         try:
             written = run_calibrate_markers(

@@ -49,7 +49,7 @@ class CompareArgs(SolverOptions):
         settings = self.settings()
         settings.check()
         if settings.uses_solver:
-            self.prepare_solver("a comparison with pad or markers")
+            self.prepare_solver()
         try:
             comparison = run_comparison(settings, out)
             written = write_comparison(comparison, out, time.perf_counter() - start)

@@ -72,7 +72,7 @@ class PressArgs(ShadowOptions, SolverOptions):
         scene = press_of(self.scene, depth=None if self.depth is None else self.depth / 1e3, scale=self.scale)
         physics = chosen_physics(self.physics, self.level, scene)
         if physics.is_simulated:
-            self.prepare_solver(f"physics={PHYSICS.name_of(physics)!r}")
+            self.prepare_solver()
         sensor = TactileSensor(
             self.sensor,
             physics=physics,

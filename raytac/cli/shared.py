@@ -18,7 +18,7 @@ from raytac.errors import InputError
 from raytac.io.options import CommonOptions
 from raytac.physics.base import PhysicsConfig
 from raytac.physics.registry import PHYSICS, scene_physics
-from raytac.physics.soft.availability import check_solver, quiet_solver
+from raytac.physics.soft.availability import quiet_solver
 from raytac.specs import PressScene, SensorSpec, TaskScene, load_sensor, with_lights
 from raytac.specs.sensor import AUTO
 
@@ -125,9 +125,8 @@ class SolverOptions(CommonOptions):
     verbose: bool = False
     """Let Warp, on which the contact solver runs, list devices and the kernels that it loads; warnings and errors only if not given."""
 
-    def prepare_solver(self, user: str) -> None:
-        """Call before ``user`` first uses the solver. Raises ``BackendError`` if it is missing."""
-        check_solver(user)
+    def prepare_solver(self) -> None:
+        """Call before the solver is first used."""
         if not self.verbose:
             quiet_solver()
 

@@ -15,7 +15,7 @@ from raytac.io.options import DeviceName, parse_names, parse_resolution
 from raytac.markers import MARKERS
 from raytac.optics import OPTICS
 from raytac.physics import PHYSICS, PhysicsConfig
-from raytac.physics.soft.availability import check_solver, quiet_solver
+from raytac.physics.soft.availability import quiet_solver
 from raytac.sensor import TactileSensor
 from raytac.specs import PADS, PressScene, TaskScene, load_scene
 from raytac.specs.sensor_file import sensor_spec
@@ -80,10 +80,8 @@ class ViewArgs(ShadowOptions):
         OPTICS.config(self.optics, **self.chosen_shadows())
         scene = load_scene(self.scene)
         physics = chosen_physics(self.physics, self.level, scene)
-        if physics.is_simulated:
-            check_solver(f"physics={PHYSICS.name_of(physics)!r}")
-            if not self.verbose:
-                quiet_solver()
+        if physics.is_simulated and not self.verbose:
+            quiet_solver()
         session = self._press(scene, physics) if isinstance(scene, PressScene) else self._task(scene, physics)
         with Viewer(session, host=self.host, port=self.port, allow_hosts=allowed) as viewer:
             print(f"raytac: {session.title}")

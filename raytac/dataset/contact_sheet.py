@@ -50,7 +50,7 @@ def contact_figure(data: PressDataset, count: int = 24, columns: int = 6) -> Fig
     axes = figure.subplots(rows * len(shown), columns, squeeze=False)
     for axis in axes.flat:
         axis.set_axis_off()
-    dents = [_dent(data, i) for i in presses] if "height" in shown else []
+    dents = [data.shared(i)["rest_height"].astype(float) - data[i]["height"] for i in presses if "height" in shown]
     deepest = max((float(np.nanmax(dent)) for dent in dents), default=0.0)
     maps = None
     for i in presses:
@@ -77,11 +77,6 @@ def contact_figure(data: PressDataset, count: int = 24, columns: int = 6) -> Fig
 def _title(data: PressDataset, i: int) -> str:
     row = {name: data.manifest[name][i].as_py() for name in ("index", "object", "press_depth")}
     return f"{row['index']}: {row['object']}, {1e3 * row['press_depth']:.2f} mm"
-
-
-def _dent(data: PressDataset, i: int) -> np.ndarray:
-    """Indentation [m], (Ny, Nx)."""
-    return data.shared(i)["rest_height"].astype(float) - data[i]["height"]
 
 
 def _bar(axis: Any, length: float) -> None:

@@ -25,7 +25,7 @@ from raytac.specs import PressScene, SensorSpec, StageSpec, SweepSpec
 from raytac.specs.toml import in_mm
 
 _DRAWS = 10
-"""Uniform numbers that every press draws, used or not: a range that changes changes no other value."""
+"""Uniform numbers that every press draws, used or not, so that ranges are independent."""
 
 
 @dataclass(frozen=True)

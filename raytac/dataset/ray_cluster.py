@@ -20,7 +20,7 @@ from raytac.dataset.renderer import RenderJob, ShardRenderer, ShardResult
 from raytac.errors import BackendError, RaytacError
 
 _ATTEMPTS = 3
-"""Times that a shard is begun before it is given up: what kills its worker each time is the shard."""
+"""Starts of a shard before it is given up, since it kills every worker."""
 
 
 class _Worker:

@@ -103,7 +103,8 @@ class ShardRenderer:
         order = sorted(arrays)
         joined = {name: np.stack([arrays[place][name] for place in order]) for name in arrays[order[0]]} if order else {}
         rows = [self._row(shard, presses, place, notes[place]) for place in range(len(presses))]
-        return ShardResult(shard, joined | built.shared if order else {}, rows, self._made_by(built))
+        made_by = {"device": built.sensor.device_used, "mode": built.sensor.label, **versions(), **git_state()}
+        return ShardResult(shard, joined | built.shared if order else {}, rows, made_by)
 
     # --- sensors ---------------------------------------------------------------------------------------------------------------
 
@@ -214,10 +215,6 @@ class ShardRenderer:
         row: Row = {f.name: getattr(presses, f.name)[place].item() for f in fields(presses) if f.name != "scene"}
         row |= {"sensor": self.plan.sweep.sensors[which].name, "variant": copy}
         return row | {"object": self._scenes[presses.scene[place]].name} | dict(note)
-
-    def _made_by(self, built: _Built) -> dict[str, str | int | float]:
-        sensor = built.sensor
-        return {"device": sensor.device_used, "mode": sensor.label, **versions(), **git_state()}
 
 
 def _figures(frame: TactileFrame, b: int) -> Row:

@@ -41,7 +41,7 @@ class RunReport:
     render_s: float
     """Time from the first shard's start to the last one's end [s], with what workers load first."""
     steady_presses_per_s: float | None
-    """Presses a second after the first shard came, when all is loaded; None if no more than that was rendered."""
+    """Presses a second after the first shard, when all is loaded; None for one shard."""
     device: str
 
 

@@ -150,13 +150,9 @@ def simulate_press(sensor: SensorSpec, press: Press, *, level: str, device: str 
     """Run a press on the soft pad of a ``level``.
 
     Raises:
-        BackendError: the solver is not installed.
         RaytacError: the press did not settle.
         SpecError: the press does not fit this sensor.
     """
-    from raytac.physics.soft.availability import check_solver
-
-    check_solver("a press on the soft pad")
     from raytac.physics.soft.pad import SoftPad
 
     soft = SoftPad(sensor, press.scene(), pitch=_PITCH, level=level, device=device)

@@ -69,9 +69,6 @@ class Ipc:
 
         The solver traces no rays, so that CUDA needs no OptiX.
         """
-        from raytac.physics.soft.availability import check_solver
-
-        check_solver("physics='ipc'")
         from raytac.physics.soft.pad import SoftPad
 
         device = resolve_device(device, ray_tracing=False)

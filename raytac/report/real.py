@@ -55,14 +55,6 @@ def _one_a_colour(sensor: SensorSpec) -> SensorSpec:
     return replace(sensor, lights=replace(sensor.lights, leds=tuple(first)))
 
 
-def _linear(sensor: SensorSpec) -> SensorSpec:
-    return replace(sensor, response=replace(sensor.response, gamma=1.0, black_level=(0.0, 0.0, 0.0)))
-
-
-def _flat(sensor: SensorSpec) -> SensorSpec:
-    return replace(sensor, gelpad=replace(sensor.gelpad, dome_radius=(np.inf, np.inf)))
-
-
 ABLATIONS: dict[str, Ablation] = {
     # The case's glow is rendered with the bounce, so it goes too: to be held against no_glow.
     "no_inter_reflection": Ablation(sensor=lambda s: _leds(s, glow=0.0), fixed=("glow",), bounce=False),
@@ -70,8 +62,10 @@ ABLATIONS: dict[str, Ablation] = {
     "point_leds": Ablation(sensor=lambda s: _leds(s, size=(1e-4, 1e-4)), fixed=("height",)),
     "no_lobe": Ablation(sensor=lambda s: _leds(s, lobe=1.0), fixed=("lobe",)),
     "no_glow": Ablation(sensor=lambda s: _leds(s, glow=0.0), fixed=("glow",)),
-    "flat_pad": Ablation(sensor=_flat),
-    "no_response_curve": Ablation(sensor=_linear, fixed=("stray",)),
+    "flat_pad": Ablation(sensor=lambda s: replace(s, gelpad=replace(s.gelpad, dome_radius=(np.inf, np.inf)))),
+    "no_response_curve": Ablation(
+        sensor=lambda s: replace(s, response=replace(s.response, gamma=1.0, black_level=(0.0, 0.0, 0.0))), fixed=("stray",)
+    ),
     "one_led_a_colour": Ablation(sensor=_one_a_colour),
     "rigid_pad_imprint": Ablation(fixed=("slope",)),
     "one_photograph_at_rest": Ablation(settle=False),

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 LARGEST_SIDE = 8192
 """Longest side of an image [px], as in sensor files."""
 SHAPE_TOLERANCE = 0.02
-"""Largest deviation from the sensor's own aspect ratio without a warning; it allows rounding to whole pixels."""
+"""Largest deviation from the aspect ratio without a warning: rounding to whole pixels."""
 
 
 def sensor_outputs(optics: str | OpticsConfig[Any] | type[OpticsConfig[Any]]) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ class PunchSpec:
     reach: float
     """ℓ: length over which what a half-space would do fades in a pad of finite thickness [m]."""
     slip: float
-    """c: the contact sticks up to a shear of c times its mean indentation times its radius [1/m]."""
+    """c: contact sticks up to a shear of c times mean indentation times radius [1/m]."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,11 @@ class MarkerMotionSpec:
     twist_max: float
     """Δθ_max of FOTS: the most that markers follow a twist [rad]."""
     field_gain: float
-    """Scale of the normalised force field: marker displacement by penetration along a wall's normal [-]."""
+    """Scale of the force field: displacement by penetration along a wall's normal [-]."""
     field_shear: float
     """Tangential over normal stiffness k_t / k_n of the force field [-]."""
     field_friction: float
-    """Friction coefficient of the force field [-]: tangential force is at most this share of the normal one."""
+    """Friction coefficient of the force field [-]."""
     provenance: str
     """Data, date and errors of the fit, as text."""
     punch: PunchSpec | None = None

@@ -18,7 +18,7 @@ MOVES = ("object", "case")
 PADS = ("coarse", "medium", "fine")
 """Mesh levels of the soft pad."""
 DYNAMICS = ("kinematic", "affine", "soft")
-"""Dynamics of an object on the soft pad: prescribed and rigid, free and near-rigid, or prescribed and soft."""
+"""Object on the soft pad: prescribed and rigid, free and near-rigid, prescribed and soft."""
 
 SCENE_SCHEMA: Final[Schema] = {
     "moves": Text(choices=MOVES, default="object"),
@@ -38,7 +38,7 @@ POSE_SCHEMA: Final[Schema] = {
 """Keys of ``[object]`` that every kind but ``none`` has."""
 
 OBJECT_KINDS: Final[dict[str, Schema]] = {**OBJECT_SCHEMA, "heights": {"pitch_mm": Number("(0, 10]")}}
-"""Kind of object to the keys of its parameters: those of scene files, and ``heights``, which is made in code."""
+"""Parameter keys by kind of object: kinds of scene files, and ``heights``, made in code."""
 
 _DURATION = {"duration_s": Number("(0, 60]", default=0.5)}
 STAGE_SCHEMA: Final[dict[str, Schema]] = {
@@ -70,7 +70,7 @@ class ObjectSpec:
     quaternion: tuple[float, float, float, float]
     """``pad_from_object`` rotation, wxyz, normalised."""
     mass: float
-    """Mass on the drive [kg]; it affects the motion to a force, not the state that it settles in."""
+    """Mass on the drive [kg]; it affects the motion to a force, not the final state."""
     dynamics: str = "kinematic"
     """One of ``DYNAMICS``; the rigid pad takes every object as rigid and driven."""
     youngs_modulus: float = 1e6
@@ -137,10 +137,10 @@ class PressScene:
     trajectory: tuple[StageSpec, ...]
     """Empty for an untouched pad."""
     moves: str = "object"
-    """Side that the trajectory moves, one of ``MOVES``. Targets are those of the object relative to the pad in both cases."""
+    """Side that moves, one of ``MOVES``; targets are of the object relative to the pad."""
     source: Path | None = None
     physics: str | None = None
-    """Name of the physics that the scene is meant for (checked when it is pressed); None leaves it to whoever presses."""
+    """Physics that the scene is meant for (checked when it is pressed); None: any."""
     pad: str | None = None
     """One of ``PADS``; None leaves it to whoever presses."""
 

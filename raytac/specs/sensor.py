@@ -176,7 +176,7 @@ class CameraSpec:
     pixel_pitch: Vec2
     """Size of one native pixel on the plane z = 0 along x and y [m]."""
     position: Vec3
-    """Pinhole (effective centre of projection) in the pad frame [m]; z < 0. The image centre looks along +z."""
+    """Pinhole (centre of projection), pad frame [m]; z < 0. The image centre looks along +z."""
     principal_point: Vec2
     """Pixel, in native pixels from the top-left image corner, that the optical axis meets [px]."""
 
@@ -293,7 +293,7 @@ class OpticsSpec:
     """Choices of rendering that the geometry leaves open, as the lights were fitted."""
 
     shadows: bool = True
-    """True casts shadows on the coat, in every optical mode that can and is not given another value."""
+    """True casts shadows on the coat, in modes that can and are not given another value."""
 
     def __post_init__(self) -> None:
         check_fields(vars(self), SENSOR_SCHEMA["optics"], "optics")
@@ -311,7 +311,7 @@ class LedSpec:
     axis: Vec3
     """Unit emission axis (front normal of the rectangle), pad frame."""
     size: Vec2
-    """Edge lengths of the rectangle [m]; the first edge lies along the direction of z × axis (or x if parallel)."""
+    """Edge lengths of the rectangle [m]; the first lies along z × axis (or x if parallel)."""
     lobe: float
     """Lobe exponent n >= 1; 1 is a Lambertian emitter."""
     power: Vec3
@@ -381,7 +381,7 @@ class SensorSpec:
     lights: LightsSpec
     optics: OpticsSpec = OpticsSpec()
     marker_motion: MarkerMotionSpec | None = None
-    """Motion of the pad's markers under a load, for models that are fitted; None if nobody fitted them."""
+    """Motion of the pad's markers under a load, for fitted models; None if not fitted."""
     source: Path | None = None
     """File that it was read from."""
 

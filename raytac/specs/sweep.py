@@ -78,9 +78,9 @@ class PressRanges:
     yaw: Range = (0.0, 0.0)
     """Turn of the object about the pad's normal, +z [rad]."""
     tilt: Range = (0.0, 0.0)
-    """Lean of the object, turned by yaw, away from +z [rad]; the direction of the lean is uniform over the circle."""
+    """Lean of the object, turned by yaw, from +z [rad]; its direction is uniform."""
     shear: Range = (0.0, 0.0)
-    """Length of the sideways displacement after the indent [m]; its direction is uniform over the circle."""
+    """Length of the sideways displacement after the indent [m]; its direction is uniform."""
     twist: Range = (0.0, 0.0)
     """Turn about +z after that, in contact [rad]."""
 
@@ -122,7 +122,7 @@ class SweepSpec:
     variants: int = 1
     """Drawn copies of every sensor, where the randomisation changes sensors."""
     randomization: Mapping[str, float] = field(default_factory=dict)
-    """Fields of ``raytac.observe.Randomization`` by name, those that ``RANDOMIZATION_SCHEMA`` has."""
+    """Fields of ``raytac.observe.Randomization`` that ``RANDOMIZATION_SCHEMA`` has."""
     marker_perturbation: Mapping[str, float] = field(default_factory=dict)
     """Fields of ``raytac.markers.MarkerPerturbation`` by name."""
     source: Path | None = None

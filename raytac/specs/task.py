@@ -71,7 +71,7 @@ SHAPE_SCHEMA: Final[dict[str, Schema]] = {
     "box": {key: Number("(0, 5000]") for key in ("length_mm", "width_mm", "height_mm")},
     "plane": {},
 }
-"""Kind of body to the keys of its own in ``[[body]]``: a press scene's objects, larger boxes, and half-spaces."""
+"""Keys in ``[[body]]`` by kind: objects of press scenes, larger boxes, half-spaces."""
 
 BODY_SCHEMA: Final[Schema] = {
     "name": _NAME,
@@ -102,7 +102,7 @@ class MountSpec:
     kind: str | None = None
     """``body`` or ``site`` where ``at`` is the name of both."""
     position: Vec3 | None = None
-    """Origin of the pad frame in the frame of ``at`` [m]; None: the sensor stands there with its back."""
+    """Origin of the pad frame in the frame of ``at`` [m]; None: the back stands there."""
     quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
     """Rotation of the pad frame in the frame of ``at``, wxyz; matters only with ``position``."""
 
@@ -124,7 +124,7 @@ class RobotSpec:
     opening: float | None = None
     """Gap between both pads at the start [m]; None: as wide as the gripper opens."""
     position: Vec3 = (0.0, 0.0, 0.0)
-    """Start of a ``floating_gripper`` (point midway between the pads) or a ``fixed_sensor`` (pad frame) [m]."""
+    """Start of a ``floating_gripper`` (midway between pads) or ``fixed_sensor`` (pad) [m]."""
     quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
     """Orientation there, wxyz."""
     mounts: tuple[MountSpec, ...] = ()
@@ -152,7 +152,7 @@ class BodySpec:
 
     name: str
     kind: str
-    """Shape: a kind of a press scene's object but ``none``, or ``plane``, the half-space under z = 0 of its frame."""
+    """An object's kind but ``none``, or ``plane``: the half-space under z = 0 of its frame."""
     params: dict[str, float | int | str]
     """As in ``ObjectSpec``."""
     position: Vec3 = (0.0, 0.0, 0.0)
@@ -162,13 +162,13 @@ class BodySpec:
     dynamics: str = "free"
     """One of ``MOTIONS``."""
     owner: str = "ipc"
-    """One of ``OWNERS``, of a free body where the pads are simulated; with the rigid pad all is MuJoCo's."""
+    """One of ``OWNERS``, of a free body with soft pads; with rigid pads all is MuJoCo's."""
     mass: float | None = None
     """[kg]; None: by ``density``."""
     density: float = 1000.0
     """[kg/m³]; plays no part where ``mass`` is given."""
     friction: float | None = None
-    """Coulomb friction coefficient; None: the gelpad's own against a gel, ``PAIR_FRICTION`` against anything else."""
+    """Friction coefficient; None: the gelpad's own against gel, else ``PAIR_FRICTION``."""
     gel_friction: float | None = None
     """The same against gel alone, in place of ``friction``; None: ``friction``."""
     youngs_modulus: float = 1e6
@@ -178,7 +178,7 @@ class BodySpec:
     cell: float | None = None
     """Edge of a soft body's tetrahedra [m]; None: the solver's choice."""
     held_by: str | None = None
-    """Fixed body that holds the part of a soft body which lies inside of it or touches it at the start."""
+    """Fixed body that holds what of a soft body is inside or touches it at the start."""
     colour: Vec3 | None = None
     """Linear red, green, blue in [0, 1] for pictures."""
 
@@ -201,7 +201,7 @@ class TaskScene:
     robot: RobotSpec
     bodies: tuple[BodySpec, ...]
     physics: str | None = None
-    """Name of the physics that the scene is meant for (checked when a world is made); None leaves it to the user."""
+    """Physics that the scene is meant for (checked when a world is made); None: any."""
     pad: str | None = None
     """One of ``raytac.specs.press.PADS``; None leaves it to the user."""
     timestep: float = 0.002

@@ -12,7 +12,7 @@ from raytac.errors import InputError, RaytacError
 from raytac.view.session import Session, Snapshot
 
 _FASTEST = 1.0 / 30.0
-"""Least time between two states while playing [s]: no browser shows more, and a slow line is not flooded."""
+"""Least time between two states while playing [s]; spares slow lines."""
 _SMOOTH = 0.8
 """Share of the old value in the smoothed frame rate."""
 
@@ -176,7 +176,7 @@ class Player:
             self._fail(error)
 
     def _fail(self, error: Exception) -> None:
-        """Stop moving and say why; a fault of ours is also printed in full, where whoever started the program sees it."""
+        """Stop moving and say why; a fault of ours is also printed in full."""
         text = str(error)
         if not isinstance(error, RaytacError):
             text = f"{type(error).__name__}: {error}"

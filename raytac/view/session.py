@@ -28,7 +28,7 @@ class Quantity:
     factor: float
     """Shown value of one SI unit."""
     least: float
-    """Smallest full scale of the legend, in the shown unit, so that noise of a pad at rest is not blown up."""
+    """Smallest full scale of the legend, in the shown unit; it hides the noise at rest."""
 
 
 QUANTITIES = {
@@ -55,7 +55,7 @@ class Control:
     hint: str = ""
     """A sentence that the page shows on hovering."""
     instead_of: str = ""
-    """Name of another control that this one takes over from when it is moved, as a force does from a depth; empty is none."""
+    """Control that this one replaces when it is moved, as force does depth; empty is none."""
 
 
 def check_targets(controls: Sequence[Control], targets: Mapping[str, float]) -> None:
@@ -144,7 +144,7 @@ class PadView:
     rgb: np.ndarray | None = None
     """Tactile image, shape (H, W, 3), uint8; None if the session makes none."""
     markers_px: tuple[np.ndarray, np.ndarray] | None = None
-    """Markers at rest and their displacement, pixels of ``rgb``, shapes (M, 2); NaN for one that is not seen."""
+    """Markers at rest and displacement, pixels of ``rgb``, (M, 2); NaN where not seen."""
     wrench: np.ndarray | None = None
     """Force [N] and torque about the pad frame's origin [N m] on the pad, pad frame, shape (6,)."""
 
@@ -155,7 +155,7 @@ class Snapshot:
 
     pads: Mapping[str, PadView]
     poses: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """``world_from_solid`` (4, 4) by name of solid or lines; those that are missing stay where they are."""
+    """``world_from_solid`` (4, 4) by name of solid or lines; others stay where they are."""
     reshaped: Mapping[str, np.ndarray] = field(default_factory=dict)
     """New vertices (V, 3) [m] of solids that deform."""
     controls: Mapping[str, float] = field(default_factory=dict)
@@ -190,7 +190,7 @@ class Session(Protocol):
     controls: tuple[Control, ...]
     """Their ends may move while the scene moves, their names not."""
     is_driven_at_rest: bool
-    """True if a moved control moves the scene at once although it is paused: for what is quasi-static."""
+    """True if a moved control moves a paused scene too: for what is quasi-static."""
     solids: tuple[Solid, ...]
     lines: tuple[Lines, ...]
     pads: tuple[Pad, ...]
@@ -200,7 +200,7 @@ class Session(Protocol):
         ...
 
     def resume(self) -> None:
-        """Go on with the scene's own motion, from its start if it has ended or was left for the controls."""
+        """Go on with the scene's own motion; from its start if it ended or controls took over."""
         ...
 
     def drive(self, targets: Mapping[str, float]) -> None:

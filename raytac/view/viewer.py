@@ -14,7 +14,7 @@ from raytac.view.server import PageAddresses
 from raytac.view.session import Session
 
 _PATIENCE = 10.0
-"""Longest wait at the end for the state that is being computed [s]; the thread is a daemon and ends with the program."""
+"""Longest wait at the end for the state being computed [s]; its thread is a daemon."""
 
 
 def check_viewer() -> None:

@@ -17,7 +17,6 @@ from raytac.frame import TactileFrame
 from raytac.gel.surface import chosen_envs
 from raytac.physics.base import PhysicsConfig
 from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
-from raytac.physics.soft.availability import check_solver
 from raytac.robots.arm import Arm
 from raytac.robots.impedance import JointImpedance
 from raytac.robots.states import Numbers, StateReader, body_pose, numbers, site_pose
@@ -182,8 +181,6 @@ class TactileWorld:
             self._holding.aim(self.composed.start[self.arm.qpos], np.zeros(1), np.zeros(1), self.composed.ctrl[others])
         self._failed, self._stepped = np.zeros(num_envs, bool), Lock()
         self._start_over(range(num_envs))
-        if self.physics.is_simulated:
-            check_solver(f"physics={name!r}")
         self._pads: WorldPads = WORLD_PADS.config_class(name)(
             self.composed, self.models, self.data, physics=self.physics, coupling=self.coupling, device=device
         )

@@ -9,7 +9,6 @@ everything is a launch of fixed size on arrays of fixed address, so that it can 
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
 # pyright: reportIndexIssue=false, reportInvalidTypeForm=false
-# (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 

@@ -1,38 +1,23 @@
-"""Availability of the contact solver, and the messages of Warp, on which it runs."""
+"""Messages of Warp, on which the contact solver runs."""
 
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import os
 from collections.abc import Iterator
 
 from raytac.device import cuda_device_count
-from raytac.errors import BackendError
 from raytac.installation import foreign_ipc
-
-
-def check_solver(user: str) -> None:
-    """Refuse in one line if the solver is missing, before an ``ImportError`` from deep inside.
-
-    Args:
-        user: the feature that needs the solver; the message begins with it.
-
-    Raises:
-        BackendError: Warp is not installed.
-    """
-    if importlib.util.find_spec("warp") is None:
-        raise BackendError(f'{user} needs the contact solver, and Warp is not installed: `pip install "raytac[ipc]"`')
 
 
 def quiet_solver() -> None:
     """Let Warp print only warnings and errors in this process.
 
     Warp otherwise lists devices and every module that it loads. The level belongs to the process, so ``ipc`` and ``TactileSensor`` leave it
-    alone: this is for programs, such as the ``raytac`` command. Call it before the solver is first used. Nothing happens without Warp or
+    alone: this is for programs, such as the ``raytac`` command. Call it before the solver is first used. Nothing happens without
     raytac's own ``ipc``.
     """
-    if importlib.util.find_spec("warp") is None or foreign_ipc() is not None:
+    if foreign_ipc() is not None:
         return
     import warp as wp
 

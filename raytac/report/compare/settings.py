@@ -9,7 +9,6 @@ from pathlib import Path
 from raytac.checks import check_seed
 from raytac.errors import BackendError, InputError
 from raytac.markers.base import marker_motion_of
-from raytac.physics.soft.availability import check_solver
 from raytac.report.image_error import SSIM_BORDER
 from raytac.sensor import LARGEST_SIDE
 from raytac.specs import PADS, load_press, load_sensor, validate_press
@@ -57,7 +56,7 @@ class CompareSettings:
             InputError: a number or a resolution out of range, two scenes of one name, or a sensor without the marker motion that
                 ``markers`` needs.
             SpecError: an unknown sensor or scene, or a file that breaks a rule.
-            BackendError: a package of the ``report`` extra is missing, or the solver's where ``pad`` or ``markers`` need it.
+            BackendError: a package of the ``report`` extra is missing.
         """
         for name, value, lowest in (
             ("reference spp", self.reference_spp, 2),
@@ -89,8 +88,6 @@ class CompareSettings:
         missing = [name for name in ("jinja2", "pyarrow", "skimage") if importlib.util.find_spec(name) is None]
         if missing:
             raise BackendError(f"the report needs {', '.join(missing)}: `pip install 'raytac[report]'`")
-        if self.uses_solver:
-            check_solver("a comparison with pad or markers")
 
     @property
     def uses_solver(self) -> bool:
