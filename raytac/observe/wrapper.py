@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode
 
-from raytac.errors import InputError
+from raytac.errors import BackendError, InputError
 from raytac.frame import TactileFrame
 from raytac.observe.observer import TactileObserver
 from raytac.observe.spaces import gymnasium_space
+
+try:
+    import gymnasium
+    from gymnasium.vector import AutoresetMode
+except ModuleNotFoundError as error:
+    raise BackendError("Gymnasium is not installed: pip install 'raytac[rl]'") from error
 
 Frames = Callable[..., Mapping[str, TactileFrame]]
 """Function that returns the present frame of each sensor, as ``TactileWorld.observe``. Where some environments of a vector are reset it

@@ -90,7 +90,7 @@ class TactileWorld:
         seed: int = 0,
         pitch: float | None = None,
     ) -> None:
-        """Compose the scene and put it at its start; sensors are made on first use.
+        """Compose the scene and put it at its start; sensors are made on first use, their settings are checked here.
 
         Args:
             scene: name of a shipped task scene, path of a scene file, or a scene; or a ``MjSpec`` or ``MjModel`` with sensors that
@@ -350,9 +350,9 @@ class TactileWorld:
         return read if self.arm is None else read | {"joints": self.arm.numbers()["joints"]}
 
     def observe(
-        self, sensors: Sequence[str] | None = None, envs: np.ndarray | list[int] | None = None
+        self, sensors: Sequence[str] | str | None = None, envs: np.ndarray | list[int] | None = None
     ) -> dict[str, TactileFrame]:
-        """Frames of the sensors named (all if None), of all environments at once; images and markers are computed here.
+        """Frames of the sensor or sensors named (all if None), of all environments at once; images and markers are computed here.
 
         Markers that depend on a contact's history (``fots``) use only the states that are observed: observe them in every control step.
 
@@ -414,9 +414,11 @@ class TactileWorld:
 
     def _constant_controls(self, control: np.ndarray) -> np.ndarray:
         values = np.asarray(control, float)
-        if values.shape not in ((self.model.nu,), (self.num_envs, self.model.nu)) or not np.isfinite(values).all():
-            rule = f"must be finite, of shape ({self.model.nu},) or ({self.num_envs}, {self.model.nu})"
+        if values.shape not in ((self.model.nu,), (self.num_envs, self.model.nu)):
+            rule = f"is its shape, which must be ({self.model.nu},) or ({self.num_envs}, {self.model.nu})"
             raise InputError("control", value=values.shape, rule=rule)
+        for index in np.argwhere(~np.isfinite(values)).tolist():
+            raise InputError(f"control{index}", value=float(values[tuple(index)]), rule="must be finite")
         return np.broadcast_to(values, (self.num_envs, self.model.nu))
 
     def _check_start(self) -> None:
