@@ -184,6 +184,24 @@ class TactileWorld:
         )
         self._check_start()
 
+    def __repr__(self) -> str:
+        name, sensors = "own model" if self.scene is None else repr(self.scene.name), ", ".join(self.sensor_names)
+        touched = ", ".join(self.composed.bodies)
+        return f"TactileWorld({name}, sensors: {sensors}; bodies: {touched}; {self.num_envs} environments, {self.physics.label})"
+
+    def __reduce__(self) -> Any:
+        """Raise ``InputError``: MuJoCo's states and recorded kernels belong to one process."""
+        raise InputError("world", value=self, rule="cannot be copied or pickled: build one in each process")
+
+    def __enter__(self) -> TactileWorld:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Do nothing, any number of times: memory and kernels go with the last reference, and no file, thread or window is held."""
+
     @property
     def sensors(self) -> dict[str, TactileSensor]:
         """Every sensor by its name, made on first use."""
@@ -421,6 +439,12 @@ class TactileWorld:
             raise InputError(f"control{index}", value=float(values[tuple(index)]), rule="must be finite")
         return np.broadcast_to(values, (self.num_envs, self.model.nu))
 
+    def _size_if_large(self, name: str) -> str:
+        """End of a message: the diameter of a body's largest geom, if it is beyond 1 m."""
+        geoms = list(self.composed.bodies[name].geoms)
+        size = 2.0 * float(self.model.geom_rbound[geoms].max(initial=0.0))
+        return f"; it is {size:.3g} m large: are its units metres?" if size > 1.0 else ""
+
     def _check_start(self) -> None:
         """Raise ``InputError`` for a start in which bodies overlap; a model of one's own may start in contact, but not through a pad."""
         data, model = self.data[0], self.model
@@ -433,5 +457,5 @@ class TactileWorld:
             if depth > (_OVERLAP if self.scene is not None else np.inf) or np.isinf(depth):
                 rule = f"must not be pressed into the pad of {sensor!r} at the start; it is, by {depth * 1e3:.3g} mm"
                 if np.isinf(depth):
-                    rule = f"must not start beyond the face that the gel of {sensor!r} is bonded to"
+                    rule = f"must not start beyond the face that the gel of {sensor!r} is bonded to{self._size_if_large(body)}"
                 raise InputError("body", value=body, rule=rule)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -61,3 +63,41 @@ def test_errors_of_controls_name_the_shape_or_the_number() -> None:
     bad[1, 0] = np.nan
     with pytest.raises(InputError, match=r"control\[1, 0\].*nan"):
         drivable.step(bad)
+
+
+def test_a_world_is_not_copied_and_says_what_it_is(world: TactileWorld) -> None:
+    for action in (copy.deepcopy, pickle.dumps):
+        with pytest.raises(InputError, match="build one in each process"):
+            action(world)
+    with world as same:
+        assert same is world
+    world.close()
+    mounted = world.composed.sensors[0]
+    texts = [repr(one) for one in (world, world.step(), mounted)]
+    assert max(map(len, texts)) < 400 and "2 environments" in texts[0] and "wrench={sensor: float64 (2, 6)}" in texts[1]
+    assert "gelsight_mini_9x11" in texts[2]
+
+
+def test_two_sensors_at_one_place_are_refused() -> None:
+    spec = mujoco.MjSpec.from_string(f'<mujoco><option cone="elliptic"/><worldbody>{BALL}</worldbody></mujoco>')
+    for name in ("one", "two"):
+        mount(spec, "gelsight_mini_9x11", body="world", pose=np.eye(4), name=name)
+    with pytest.raises(InputError, match=r"'two'.*is mounted where 'one' is"):
+        TactileWorld(spec)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"), [({"pose": np.eye(4) + 25.0 * np.eye(4, k=3)}, "25 m from.*in metres"), ({"mass": 22.0}, "22 kg.*in kilograms")]
+)
+def test_millimetres_and_grams_are_warned_of(options: dict[str, Any], message: str) -> None:
+    with pytest.warns(UserWarning, match=message) as caught:
+        mount(mujoco.MjSpec.from_string("<mujoco/>"), "gelsight_mini", body="world", **options)
+    assert caught[0].filename == __file__
+
+
+def test_a_body_in_millimetres_is_asked_for_its_units() -> None:
+    ball = BALL.replace("0 0 .0052", "0 0 4.99").replace(".005", "5")
+    spec = mujoco.MjSpec.from_string(f'<mujoco><option cone="elliptic"/><worldbody>{ball}</worldbody></mujoco>')
+    mount(spec, "gelsight_mini_9x11", body="world", pose=np.eye(4))
+    with pytest.raises(InputError, match=r"bonded to; it is 10 m large: are its units metres\?"):
+        TactileWorld(spec)
