@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from raytac import InputError, PadStepper, TactileReader, TactileWorld, mount
+from raytac.gel.traction import cell_areas
 
 BALL = '<body name="ball" pos="0 0 .0052"><freejoint/><geom size=".005" mass=".05"/></body>'
 
@@ -101,3 +102,16 @@ def test_a_body_in_millimetres_is_asked_for_its_units() -> None:
     mount(spec, "gelsight_mini_9x11", body="world", pose=np.eye(4))
     with pytest.raises(InputError, match=r"bonded to; it is 10 m large: are its units metres\?"):
         TactileWorld(spec)
+
+
+def test_what_the_page_on_own_models_says_of_a_frame() -> None:
+    world = TactileWorld(lying(), outputs=("wrench", "traction"), markers="fots", pitch=0.4e-3)
+    for _ in range(100):
+        world.step()
+    frame = world.observe("sensor")["sensor"]
+    assert -frame.force[0, 2] == pytest.approx(0.05 * 9.81, rel=1e-3)
+    np.testing.assert_array_equal(frame.wrench[:, :3], frame.force)
+    areas = cell_areas(frame.surface.grid)[..., None]
+    np.testing.assert_allclose((frame.traction * areas).sum((1, 2)), frame.force, atol=1e-6)
+    assert frame.markers.displacement.shape == frame.markers.displacement_px.shape == (1, 99, 2)
+    assert frame.surface.indentation.max() > 5e-5 and not frame.failed.any()
