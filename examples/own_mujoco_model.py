@@ -3,25 +3,14 @@
 Run: python examples/own_mujoco_model.py
 """
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 
 import raytac
 
-GRIPPER = """
-<mujoco><option timestep="0.002" cone="elliptic" integrator="implicitfast"/>
-<default><geom friction="0.8"/><joint type="slide" armature="0.1" damping="2"/><position kp="500" dampratio="1"/></default>
-<worldbody><geom name="floor" type="plane" size="1 1 .1"/><light pos="0 0 1"/>
-<body name="hand" pos="0 0 .1" gravcomp="1"><joint name="lift" axis="0 0 1"/><geom type="box" size=".02 .08 .01" mass=".3"/>
-<body name="left_finger" pos="0 .045 -.088" gravcomp="1"><joint name="left" axis="0 1 0"/>
-<geom type="box" size=".01 .004 .035" pos="0 .005 .045" mass=".03"/><site name="left_tip" zaxis="0 -1 0"/></body>
-<body name="right_finger" pos="0 -.045 -.088" gravcomp="1"><joint name="right" axis="0 -1 0"/>
-<geom type="box" size=".01 .004 .035" pos="0 -.005 .045" mass=".03"/><site name="right_tip" zaxis="0 1 0"/></body></body>
-<body name="cube" pos="0 0 .012"><freejoint/><geom type="box" size=".01 .01 .012" mass=".05"/></body></worldbody>
-<actuator><position name="lift" joint="lift" kp="2000"/><position joint="left"/><position joint="right"/></actuator></mujoco>
-"""
-
-spec = mujoco.MjSpec.from_string(GRIPPER)
+spec = mujoco.MjSpec.from_file(str(Path(__file__).with_name("gripper.xml")))
 raytac.mount(spec, "gelsight_mini_9x11", site="left_tip", name="left")
 raytac.mount(spec, "gelsight_mini", site="right_tip", name="right")
 world = raytac.TactileWorld(spec, touches=["cube"], control_timestep=0.02, outputs=("height", "wrench"), pitch=0.4e-3)

@@ -192,6 +192,9 @@ def _no_denoiser() -> str:
     return "not installed: only denoise=True needs it" if absent else ""
 
 
+_VIEW = "import viser, websockets, msgspec; print('viser', viser.__version__)"
+_RL = "import gymnasium, mink; print('gymnasium', gymnasium.__version__)"
+
 PROBES = (
     Probe(
         "mitsuba-cuda", _TRACE.format(device="cuda"), False,
@@ -220,6 +223,14 @@ PROBES = (
     Probe(
         "report", _REPORT, False, "pip install 'raytac[report]'",
         _absent("raytac compare needs it", "jinja2", "pyarrow", "skimage"),
+    ),
+    Probe(
+        "view", _VIEW, False, "pip install 'raytac[view]'",
+        _absent("raytac view needs it", "viser", "websockets", "msgspec"),
+    ),
+    Probe(
+        "rl", _RL, False, "pip install 'raytac[rl]'",
+        _absent("raytac.envs and AddTactile need it", "gymnasium", "mink"),
     ),
 )  # fmt: skip
 

@@ -72,9 +72,11 @@ class ViewArgs(ShadowOptions):
     """Let Warp, on which the contact solver runs, list devices and the kernels that it loads."""
 
     def run(self) -> int:
-        from raytac.view.viewer import Viewer, check_address, check_viewer
+        from raytac.view.availability import check_viewer
 
         check_viewer()
+        from raytac.view.viewer import Viewer, check_address
+
         allowed = () if self.allow_host is None else parse_names(self.allow_host, "allow_host")
         check_address(self.host, self.port, allowed)
         OPTICS.config(self.optics, **self.chosen_shadows())

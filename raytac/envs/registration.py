@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from typing import Final
 
-import gymnasium
+from raytac.errors import BackendError
+
+try:
+    import gymnasium
+except ModuleNotFoundError as error:
+    raise BackendError("Gymnasium is not installed: pip install 'raytac[rl]'") from error
 
 _MODULES: Final = {"PushCube": "push_cube", "BalancePole": "balance_pole", "LiftCube": "lift_cube", "RollBall": "roll_ball"}
 IDS: Final = tuple(f"raytac/{name}-v0" for name in _MODULES)

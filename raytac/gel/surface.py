@@ -204,7 +204,7 @@ def make_grid(gelpad: GelpadSpec, pitch: float) -> PadGrid:
     check_number("pitch", pitch, "(0, inf)", "m")
     for axis, size in zip("xy", gelpad.size, strict=True):
         if not 1.5 <= size / pitch <= MOST_CELLS:
-            rule = f"must divide the pad's {size:g} m along {axis} into 2 to {MOST_CELLS} cells"
+            rule = f"in metres, must divide the pad's {size:g} m along {axis} into 2 to {MOST_CELLS} cells"
             raise InputError("pitch", value=pitch, rule=rule)
     x, y = (np.linspace(-0.5 * size, 0.5 * size, round(size / pitch) + 1) for size in gelpad.size)
     return PadGrid(x=x, y=y, rest=rest_height(gelpad, x[None, :], y[:, None]))

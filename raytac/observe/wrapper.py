@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode
 
-from raytac.errors import InputError
+from raytac.errors import BackendError, InputError
 from raytac.frame import TactileFrame
 from raytac.observe.observer import TactileObserver
 from raytac.observe.spaces import gymnasium_space
+
+try:
+    import gymnasium
+    from gymnasium.vector import AutoresetMode
+except ModuleNotFoundError as error:
+    raise BackendError("Gymnasium is not installed: pip install 'raytac[rl]'") from error
 
 Frames = Callable[..., Mapping[str, TactileFrame]]
 """Function that returns the present frame of each sensor, as ``TactileWorld.observe``. Where some environments of a vector are reset it
@@ -45,7 +49,7 @@ class AddTactile(gymnasium.Wrapper):
             InputError: an observer of several environments, or a name that the observation has already.
         """
         super().__init__(env)
-        _check(observers, 1)
+        _check(observers, 1, frames)
         self.observers, self._frames = dict(observers), frames
         self.observation_space = _space(env.observation_space, observers)
 
@@ -89,7 +93,7 @@ class AddTactileVector(gymnasium.vector.VectorWrapper):
             InputError: an observer of another number of environments, or a name that the observation has already.
         """
         super().__init__(env)
-        _check(observers, env.num_envs)
+        _check(observers, env.num_envs, frames)
         self.observers, self._frames = dict(observers), frames
         self.single_observation_space = _space(env.single_observation_space, observers)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, env.num_envs)
@@ -129,7 +133,10 @@ class AddTactileVector(gymnasium.vector.VectorWrapper):
         return _dict(observation) | _observed(self.observers, frames, envs)
 
 
-def _check(observers: Mapping[str, TactileObserver], count: int) -> None:
+def _check(observers: Mapping[str, TactileObserver], count: int, frames: Frames) -> None:
+    if not callable(frames):
+        rule = "must be a function that returns frames: pass the function, as world.observe, not its result"
+        raise InputError("frames", value=type(frames).__name__, rule=rule)
     for name, observer in observers.items():
         if observer.num_envs != count:
             rule = "must be of one environment" if count == 1 else f"must be of {count} environments"

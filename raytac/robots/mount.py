@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +34,8 @@ _IN_CODE = "made in code"
 _TOUCH_RADIUS = 3e-3
 """Contact radius [m] and mass [kg] for which MuJoCo's own contact of a gel is as stiff as the gel (a guess: a finger's tip, a cube)."""
 _TOUCH_MASS = 0.05
+_FARTHEST, _HEAVIEST = 1.0, 5.0
+"""Distance from the carrier [m] and mass of a sensor [kg] beyond which millimetres or grams are likely: GelSights weigh 20 to 200 g."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,9 @@ class MountedSensor:
     """Site at the pad as designed, on the body that carries the sensor: it stays there when a world mounts the pad with an error."""
     spec: SensorSpec
     """The sensor."""
+
+    def __repr__(self) -> str:
+        return f"MountedSensor({self.name!r}, sensor={self.spec.name!r}, body={self.body!r}, site={self.site!r})"
 
     def world_from_pad(self, data: mujoco.MjData) -> np.ndarray:
         """Pose (4, 4) of the pad frame after the last ``mj_kinematics`` or ``mj_step``."""
@@ -135,7 +142,12 @@ def mount(
     for what, elements, new in [*taken, ("geom", spec.geoms, (mounted.case, mounted.gel))]:
         for one in sorted(set(new) & set(_names(elements))):
             raise InputError("name", value=name, rule=f"must be new: the robot has a {what} {one!r} already")
-    child = _sensor_model(loaded, placement, *_masses(loaded, mass), collide=check_truth("collide", collide))
+    masses, distance = _masses(loaded, mass), float(np.linalg.norm(placement[:3, 3]))
+    if distance > _FARTHEST:
+        warnings.warn(f"pose puts {name!r} {distance:g} m from what carries it: poses are in metres", stacklevel=2)
+    if mass is not None and mass > _HEAVIEST:
+        warnings.warn(f"mass makes {name!r} weigh {mass:g} kg: masses are in kilograms", stacklevel=2)
+    child = _sensor_model(loaded, placement, *masses, collide=check_truth("collide", collide))
     if isinstance(carrier, mujoco.MjsSite):
         spec.attach(child, prefix=f"{name}_", site=carrier)
     else:
@@ -143,6 +155,18 @@ def mount(
     source = _IN_CODE if isinstance(sensor, SensorSpec) else str(sensor.resolve() if isinstance(sensor, Path) else sensor)
     spec.add_text(name=f"{_MARK}{name}", data=source)
     return mounted
+
+
+def _check_apart(model: mujoco.MjModel, mounted: Sequence[MountedSensor]) -> None:
+    """Raise ``InputError`` for two sensors at one place of one body."""
+    bodies = [int(model.body(one.body).id) for one in mounted]
+    for i, j in itertools.combinations(range(len(bodies)), 2):
+        one, other = bodies[i], bodies[j]
+        near = np.linalg.norm(model.body_pos[one] - model.body_pos[other]) < 1e-6
+        turned = 1.0 - abs(model.body_quat[one] @ model.body_quat[other])
+        if model.body_parentid[one] == model.body_parentid[other] and near and turned < 1e-9:
+            rule = f"is mounted where {mounted[i].name!r} is: same carrier, same pose"
+            raise InputError("sensors", value=mounted[j].name, rule=rule)
 
 
 SensorChoice = Sequence[str | MountedSensor] | Mapping[str, str | Path | SensorSpec]
@@ -158,7 +182,8 @@ def mounted_sensors(model: mujoco.MjModel, sensors: SensorChoice | None = None) 
             needs whose sensors were mounted as specifications. None is every sensor that the model says it has.
 
     Raises:
-        InputError: no sensor, a name that the model does not have or that is given twice, or a sensor that only its maker knows.
+        InputError: no sensor, a name that the model does not have or that is given twice, two sensors at one place, or a sensor
+            that only its maker knows.
         SpecError: a sensor's file is missing or wrong.
     """
     marked = _marked(model)
@@ -187,6 +212,7 @@ def mounted_sensors(model: mujoco.MjModel, sensors: SensorChoice | None = None) 
         if mounted.name in (other.name for other in result):
             raise InputError("sensors", value=mounted.name, rule="must not name a sensor twice")
         result.append(mounted)
+    _check_apart(model, result)
     return tuple(result)
 
 

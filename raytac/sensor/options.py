@@ -43,6 +43,8 @@ def checked_outputs(outputs: Sequence[str] | str, optics: OpticsConfig[Any]) -> 
     """
     if outputs == "markers" or (isinstance(outputs, (list, tuple)) and "markers" in outputs):
         raise InputError("outputs", value=outputs, rule="markers are asked for by the argument markers, as in markers='fots'")
+    if outputs == "force" or (isinstance(outputs, (list, tuple)) and "force" in outputs):
+        raise InputError("outputs", value=outputs, rule="frame.force always comes, without asking; 'wrench' adds its torque")
     outputs, offered = check_names("outputs", outputs, OUTPUTS), sensor_outputs(optics)
     for name in outputs:
         if name not in offered:

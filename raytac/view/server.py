@@ -11,14 +11,18 @@ from math import dist, hypot, isfinite
 from types import FunctionType, ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any
 
-import msgspec
-import websockets.asyncio.server
-from websockets.asyncio.server import ServerConnection
-from websockets.exceptions import ConnectionClosed
-from websockets.frames import CloseCode
-from websockets.http11 import Request, Response
-
 from raytac.errors import BackendError, InputError
+from raytac.view.availability import NOT_INSTALLED
+
+try:
+    import msgspec
+    import websockets.asyncio.server
+    from websockets.asyncio.server import ServerConnection
+    from websockets.exceptions import ConnectionClosed
+    from websockets.frames import CloseCode
+    from websockets.http11 import Request, Response
+except ModuleNotFoundError as error:
+    raise BackendError(NOT_INSTALLED) from error
 
 if TYPE_CHECKING:
     from viser import ViserServer

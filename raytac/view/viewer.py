@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 import socket
 from collections.abc import Sequence
 from types import TracebackType
 
-from raytac.errors import BackendError, InputError
+from raytac.errors import InputError
+from raytac.view.availability import check_viewer
 from raytac.view.page import Page
 from raytac.view.player import Player
 from raytac.view.server import PageAddresses
@@ -15,12 +15,6 @@ from raytac.view.session import Session
 
 _PATIENCE = 10.0
 """Longest wait at the end for the state being computed [s]; its thread is a daemon."""
-
-
-def check_viewer() -> None:
-    """Raise ``BackendError`` if viser is not installed."""
-    if importlib.util.find_spec("viser") is None:
-        raise BackendError('the viewer needs viser, and it is not installed: `pip install "raytac[view]"`')
 
 
 class Viewer:

@@ -139,9 +139,9 @@ class PadStepper:
         return np.where(self.failed[:, None], np.nan, self._pads.wrench(name))
 
     def observe(
-        self, data: mujoco.MjData | Sequence[mujoco.MjData], sensors: Sequence[str] | None = None
+        self, data: mujoco.MjData | Sequence[mujoco.MjData], sensors: Sequence[str] | str | None = None
     ) -> dict[str, TactileFrame]:
-        """Frames of the sensors named (all if None) at the present poses.
+        """Frames of the sensor or sensors named (all if None) at the present poses.
 
         Raises:
             InputError: another number of states or an unknown sensor; as ``TactileSensor.update``.

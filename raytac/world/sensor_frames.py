@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -22,10 +23,16 @@ class SensorFrames:
     """Sensors of one model in B environments, and what they see."""
 
     def __init__(self, mounted: Sequence[MountedSensor], *, num_envs: int, seed: int, **settings: Any) -> None:
-        """``settings``: those of every ``TactileSensor``, which are checked when the first one is made."""
+        """Check the settings; sensors are made on first use.
+
+        ``settings``: those of every ``TactileSensor``. Raises what that raises, but for a device without ray tracing.
+        """
         self._mounted, self._num_envs, self._seed = tuple(mounted), num_envs, seed
         self._settings = settings
         self._made: dict[str, TactileSensor] = {}
+        with warnings.catch_warnings(action="ignore"):  # the sensors that are kept warn
+            for one in self._mounted:  # pads alone may run on a device that cannot trace rays
+                TactileSensor(one.spec, **{"seed": seed, "num_envs": num_envs, **settings, "device": "cpu"})
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -48,9 +55,9 @@ class SensorFrames:
                 sensor.reset_markers(envs)
 
     def observe(
-        self, read: Read, failed: np.ndarray, sensors: Sequence[str] | None, envs: np.ndarray | list[int] | None
+        self, read: Read, failed: np.ndarray, sensors: Sequence[str] | str | None, envs: np.ndarray | list[int] | None
     ) -> dict[str, TactileFrame]:
-        """Frames of the sensors named (None: all) in environments (a mask (B,), a list, or None for all).
+        """Frames of the sensor or sensors named (None: all) in environments (a mask (B,), a list, or None for all).
 
         Environments whose surface cannot be are marked in ``failed`` (B,).
 
@@ -61,7 +68,7 @@ class SensorFrames:
         if rows is not None and not rows:
             raise InputError("envs", value=envs, rule="must name one environment or more")
         frames = {}
-        chosen = self.names if sensors is None else tuple(sensors)
+        chosen = self.names if sensors is None else (sensors,) if isinstance(sensors, str) else tuple(sensors)
         for name in chosen:
             if name not in self.names:
                 raise InputError("sensors", value=name, rule="must be a sensor of the world", choices=self.names)

@@ -114,9 +114,9 @@ class TactileReader:
         self._frames.reset(chosen)
 
     def read(
-        self, datas: mujoco.MjData | Sequence[mujoco.MjData], sensors: Sequence[str] | None = None
+        self, datas: mujoco.MjData | Sequence[mujoco.MjData], sensors: Sequence[str] | str | None = None
     ) -> dict[str, TactileFrame]:
-        """Frames of the sensors named (all if None), a row for each state.
+        """Frames of the sensor or sensors named (all if None), a row for each state.
 
         Raises:
             InputError: another number of states, states of another model, or an unknown sensor; as ``TactileSensor.update``.

@@ -87,6 +87,9 @@ def touched_bodies(
     if isinstance(touches, str) or not isinstance(touches, (Sequence, Mapping)):
         rule = "must be names of bodies or geoms, such as ['cube'], or a mapping of them to friction coefficients"
         raise InputError("touches", value=touches, rule=rule)
+    if not touches:
+        rule = "must name one body or more; None is every body with a free joint"
+        raise InputError("touches", value=touches, rule=rule, choices=_names(model, "BODY"))
     result: list[TouchedBody] = []
     for name in touches:
         body, geom = _find(model, name)

@@ -90,7 +90,7 @@ class TactileWorld:
         seed: int = 0,
         pitch: float | None = None,
     ) -> None:
-        """Compose the scene and put it at its start; sensors are made on first use.
+        """Compose the scene and put it at its start; sensors are made on first use, their settings are checked here.
 
         Args:
             scene: name of a shipped task scene, path of a scene file, or a scene; or a ``MjSpec`` or ``MjModel`` with sensors that
@@ -185,6 +185,24 @@ class TactileWorld:
             self.composed, self.models, self.data, physics=self.physics, coupling=self.coupling, device=device
         )
         self._check_start()
+
+    def __repr__(self) -> str:
+        name, sensors = "own model" if self.scene is None else repr(self.scene.name), ", ".join(self.sensor_names)
+        touched = ", ".join(self.composed.bodies)
+        return f"TactileWorld({name}, sensors: {sensors}; bodies: {touched}; {self.num_envs} environments, {self.physics.label})"
+
+    def __reduce__(self) -> Any:
+        """Raise ``InputError``: MuJoCo's states and recorded kernels belong to one process."""
+        raise InputError("world", value=self, rule="cannot be copied or pickled: build one in each process")
+
+    def __enter__(self) -> TactileWorld:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Do nothing, any number of times: memory and kernels go with the last reference, and no file, thread or window is held."""
 
     @property
     def sensors(self) -> dict[str, TactileSensor]:
@@ -360,9 +378,9 @@ class TactileWorld:
         return read if self.arm is None else read | {"joints": self.arm.numbers()["joints"]}
 
     def observe(
-        self, sensors: Sequence[str] | None = None, envs: np.ndarray | list[int] | None = None
+        self, sensors: Sequence[str] | str | None = None, envs: np.ndarray | list[int] | None = None
     ) -> dict[str, TactileFrame]:
-        """Frames of the sensors named (all if None), of all environments at once; images and markers are computed here.
+        """Frames of the sensor or sensors named (all if None), of all environments at once; images and markers are computed here.
 
         Markers that depend on a contact's history (``fots``) use only the states that are observed: observe them in every control step.
 
@@ -425,10 +443,18 @@ class TactileWorld:
 
     def _constant_controls(self, control: np.ndarray) -> np.ndarray:
         values = np.asarray(control, float)
-        if values.shape not in ((self.model.nu,), (self.num_envs, self.model.nu)) or not np.isfinite(values).all():
-            rule = f"must be finite, of shape ({self.model.nu},) or ({self.num_envs}, {self.model.nu})"
+        if values.shape not in ((self.model.nu,), (self.num_envs, self.model.nu)):
+            rule = f"is its shape, which must be ({self.model.nu},) or ({self.num_envs}, {self.model.nu})"
             raise InputError("control", value=values.shape, rule=rule)
+        for index in np.argwhere(~np.isfinite(values)).tolist():
+            raise InputError(f"control{index}", value=float(values[tuple(index)]), rule="must be finite")
         return np.broadcast_to(values, (self.num_envs, self.model.nu))
+
+    def _size_if_large(self, name: str) -> str:
+        """End of a message: the diameter of a body's largest geom, if it is beyond 1 m."""
+        geoms = list(self.composed.bodies[name].geoms)
+        size = 2.0 * float(self.model.geom_rbound[geoms].max(initial=0.0))
+        return f"; it is {size:.3g} m large: are its units metres?" if size > 1.0 else ""
 
     def _check_start(self) -> None:
         """Raise ``InputError`` for a start in which bodies overlap; a model of one's own may start in contact, but not through a pad."""
@@ -442,5 +468,5 @@ class TactileWorld:
             if depth > (_OVERLAP if self.scene is not None else np.inf) or np.isinf(depth):
                 rule = f"must not be pressed into the pad of {sensor!r} at the start; it is, by {depth * 1e3:.3g} mm"
                 if np.isinf(depth):
-                    rule = f"must not start beyond the face that the gel of {sensor!r} is bonded to"
+                    rule = f"must not start beyond the face that the gel of {sensor!r} is bonded to{self._size_if_large(body)}"
                 raise InputError("body", value=body, rule=rule)

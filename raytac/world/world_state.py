@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from raytac.errors import InputError
+from raytac.gel.surface import summary
 
 LARGEST_SPEED = 1e4
 """Joint speed [rad/s or m/s] beyond which an environment counts as failed, long before MuJoCo sees a huge number."""
@@ -51,6 +52,9 @@ class WorldState:
     """Environments whose physics broke down, shape (B,), bool; they stand still until they are reset."""
     report: dict[str, np.ndarray] = field(default_factory=dict)
     """Report of the pads' solver on this step, each (B,); empty with the rigid pad."""
+
+    def __repr__(self) -> str:
+        return summary(self)
 
 
 def check_controls(env: int, data: mujoco.MjData) -> None:

@@ -130,3 +130,8 @@ def test_a_vector_takes_observers_of_its_size_only() -> None:
     inner = Counting(AutoresetMode.NEXT_STEP, observer.make_sensor(device="cpu", pitch=0.4e-3))
     with pytest.raises(InputError, match=r"observers\['sensor'\] = 3: must be of 2 environments"):
         AddTactileVector(inner, {"sensor": observer}, inner.frames)
+
+
+def test_frames_in_place_of_their_function_are_refused(wrapped: AddTactile) -> None:
+    with pytest.raises(InputError, match=r"frames = 'dict'.*pass the function"):
+        AddTactile(Pressing(), wrapped.observers, {})  # type: ignore[arg-type]

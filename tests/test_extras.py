@@ -1,0 +1,39 @@
+"""What needs an extra says which one, in one line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+VIEWER = "the viewer is not installed: pip install 'raytac[view]'"
+MISSING = """
+import importlib.abc, importlib.util, sys
+lost = {lost!r}
+known = importlib.util.find_spec
+importlib.util.find_spec = lambda name, package=None: None if name in lost else known(name, package)
+
+
+class Without(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in lost:
+            raise ModuleNotFoundError(f"No module named {{name!r}}")
+
+
+sys.meta_path.insert(0, Without())
+"""
+
+
+@pytest.mark.parametrize(
+    ("lost", "code", "message"),
+    [
+        (("msgspec",), "from raytac.cli import main; sys.exit(main(['view', 'coin']))", VIEWER),
+        (("msgspec",), "from raytac.view import Viewer", VIEWER),
+        (("gymnasium",), "from raytac.observe import AddTactile", "pip install 'raytac[rl]'"),
+        (("gymnasium",), "import raytac.envs", "pip install 'raytac[rl]'"),
+    ],
+)  # fmt: skip
+def test_what_is_not_installed_is_named_with_its_extra(lost: tuple[str, ...], code: str, message: str) -> None:
+    done = subprocess.run([sys.executable, "-c", MISSING.format(lost=lost) + code], capture_output=True, text=True, check=False)
+    assert done.returncode and message in done.stderr.strip().splitlines()[-1]
