@@ -16,6 +16,7 @@ from raytac.optics import OPTICS
 from raytac.sensor import TactileSensor
 from raytac.specs import SensorSpec
 from tests.conftest import Shader, make_surface
+from tests.ipc.oracles.closed_forms import BondedLayer, Elastic
 
 
 @pytest.mark.parametrize(
@@ -93,10 +94,12 @@ def test_a_frame_prints_on_one_line(sensor_spec: SensorSpec) -> None:
 
 
 def test_the_area_of_the_force_law_is_told_beside_that_of_the_surface(sensor_spec: SensorSpec) -> None:
-    """A ball on a flat pad: π R δ in the law (Hertz), and less in the surface, whose Gaussians hold the gel off the ball."""
-    sensor = TactileSensor(sensor_spec, outputs="height", num_envs=2)
-    frame = sensor.press("sphere", depths=np.array([0.3e-3, 0.5e-3]))
-    np.testing.assert_allclose(frame.force_law_area, np.pi * 3.155e-3 * np.array([0.3e-3, 0.5e-3]), rtol=0.05)
+    """A ball on a flat pad: that of the bonded layer in the law, and less in the surface, whose Gaussians hold the gel off the ball."""
+    sensor, radii = TactileSensor(sensor_spec, outputs="height", num_envs=2), np.array([0.6e-3, 1.0e-3])
+    gel = sensor_spec.gelpad
+    layer = BondedLayer(Elastic(gel.youngs_modulus, gel.poisson_ratio), gel.thickness)
+    frame = sensor.press("sphere", depths=np.array([layer.sphere(3.155e-3, radius)[0] for radius in radii]))
+    np.testing.assert_allclose(frame.force_law_area, np.pi * radii**2, rtol=0.05)
     pitch = sensor.grid.pitch
     area = frame.surface.contact.sum(axis=(1, 2)) * pitch[0] * pitch[1]
     assert (area > 0).all() and not np.allclose(area, frame.force_law_area, rtol=0.05)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from raytac.cli import main
-from raytac.errors import BackendError
 from raytac.io.metrics import check_metrics, read_metrics
 from raytac.markers.calibration import model_errors
 from raytac.markers.registry import models_without_coat
@@ -76,13 +75,6 @@ def test_metrics_and_page_hold_every_model_and_load(found: MarkerErrors, tmp_pat
 def test_a_load_under_which_nothing_moves_far_has_no_figure_for_what_moved(found: MarkerErrors) -> None:
     still = replace(found, errors=tuple(replace(row, moved=np.nan) for row in found.errors))
     assert not [key for key in marker_error_metrics(still) if key.endswith("moved_um")]
-
-
-def test_without_the_solver_the_comparison_says_so_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("pyarrow")
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "warp" else object())
-    with pytest.raises(BackendError, match=r"raytac\[ipc\]"):
-        CompareSettings(device="cpu", markers=True).check()
 
 
 @pytest.mark.slow

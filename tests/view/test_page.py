@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from raytac.errors import BackendError, InputError
-from raytac.view import viewer as viewer_module
+from raytac.view import availability
 from raytac.view.session import reaching
 from raytac.view.viewer import Viewer
 from tests.view.page_client import PageClient
@@ -170,6 +170,6 @@ def test_an_address_that_cannot_be_is_a_clear_error():
 
 
 def test_without_viser_the_error_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(viewer_module.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(BackendError, match=r"pip install \"raytac\[view\]\""):
+    monkeypatch.setattr(availability.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(BackendError, match=r"pip install 'raytac\[view\]'"):
         Viewer(StillSession(), port=0)

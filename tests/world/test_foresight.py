@@ -94,7 +94,7 @@ def test_a_step_begins_with_the_solution_that_foresaw_its_slide(monkeypatch: pyt
     for k in range(60):
         before = solves[0]
         world.step(np.array([0.02 * (k > 20), -1.0]))
-        if solves[0] > before:
+        if k > 20 and solves[0] > before + 1:  # one is the step's own, with the servo's damping
             iterations.append(int(world.data[0].solver_niter[0]))
     assert iterations and not any(iterations)
 

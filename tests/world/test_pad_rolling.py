@@ -63,7 +63,7 @@ def test_a_rolling_ball_stops_and_rocks_no_more_than_the_friction_gives_way() ->
     for timestep in (2e-3, 1e-2):
         world = rolled(0.3, 0.03, timestep)
         path = []
-        for _ in range(200):
+        for _ in range(240):
             world.step()
             path.append(float(world.data[0].qpos[0]))
         farthest = max(path)

@@ -288,7 +288,7 @@ def test_wrong_arguments_are_refused() -> None:
         world.observe(["left"])
     with pytest.raises(InputError, match=r"envs.*one environment or more"):
         world.observe(envs=[False])
-    with pytest.raises(InputError, match="must be finite, of shape"):
+    with pytest.raises(InputError, match="is its shape, which must be"):
         world.step(np.zeros(3))
     with pytest.raises(InputError, match="one for each of 1"):
         world.step([world.hold, world.hold])

@@ -39,7 +39,9 @@ def world() -> TactileWorld:
         ({"pitch": 0.4}, "in metres"),
     ],
 )
-def test_settings_of_sensors_are_checked_at_construction(make: Callable[..., Any], settings: dict[str, Any], message: str) -> None:
+def test_settings_of_sensors_are_checked_at_construction(
+    make: Callable[..., Any], settings: dict[str, Any], message: str
+) -> None:
     with pytest.raises(InputError, match=message):
         make(lying(collide=make is TactileReader), **settings)
 
@@ -88,7 +90,8 @@ def test_two_sensors_at_one_place_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "message"), [({"pose": np.eye(4) + 25.0 * np.eye(4, k=3)}, "25 m from.*in metres"), ({"mass": 22.0}, "22 kg.*in kilograms")]
+    ("options", "message"),
+    [({"pose": np.eye(4) + 25.0 * np.eye(4, k=3)}, "25 m from.*in metres"), ({"mass": 22.0}, "22 kg.*in kilograms")],
 )
 def test_millimetres_and_grams_are_warned_of(options: dict[str, Any], message: str) -> None:
     with pytest.warns(UserWarning, match=message) as caught:

@@ -187,7 +187,10 @@ def fall_along(
 
 @wp.func
 def extent(room: wp.float64, rise: wp.float64, around: wp.float64) -> wp.float64:
-    """How far [spacings] beyond a node, with ``room`` [m] left at it, a convex gap may stay low enough, by its rise to the node before."""
+    """Spacings beyond a node up to which a convex gap may stay low enough.
+
+    By its rise to the node before, and ``room`` [m], by which it is lower than enough.
+    """
     if around < _2 and rise < _0:
         return smaller(around, -room / rise)
     return around
@@ -216,8 +219,11 @@ def nodes_near(gap: wp.array(dtype=wp.float64), lane: wp.int32, nx: wp.int32, ny
 def nodes_below(
     gap: wp.array(dtype=wp.float64), lane: wp.int32, nx: wp.int32, ny: wp.int32, below: wp.float64, steep: wp.float64
 ):
-    """Where in a window, ny rows of nx nodes, a convex gap may be at ``below`` or lower [m]: x from, to, y from, to in spacings from the
-    first node, the first inf if it is nowhere. Before it the gap's lower bound [m] where no node is lower than ``below``."""
+    """Lower bound of a convex gap [m], and the part of a window of ny rows of nx nodes in which it may be at ``below`` or lower [m].
+
+    The bound is for a window in which no node is lower than ``below``. The part: x from, to, y from, to in spacings from the first node;
+    the first is inf if it is nowhere.
+    """
     least, x0, x1, y0, y1 = wp.float64(below), infinity(), -infinity(), infinity(), -infinity()
     j = lane // across()
     while j < ny:
