@@ -38,8 +38,8 @@ class PressArgs(ShadowOptions, SolverOptions):
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
     physics: Annotated[str | None, named(PHYSICS.names)] = None
-    """Model of the gel: rigid (geometry and Gaussians) or ipc (finite elements with contact and friction; needs raytac[ipc]). If not
-    given, as the scene says, else rigid."""
+    """Model of the gel: rigid (geometry and Gaussians) or ipc (finite elements with contact and friction; soft objects need
+    raytac[ipc]). If not given, as the scene says, else rigid."""
     level: Annotated[str | None, named(PADS)] = None
     """Resolution of a soft pad's mesh, so that physics is ipc if not given; as the scene says if not given, else coarse."""
     optics: Annotated[str, named(OPTICS.names)] = "raytrace"

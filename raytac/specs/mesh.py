@@ -61,6 +61,10 @@ def load_mesh(path: str | Path, scale: float) -> tuple[np.ndarray, np.ndarray]:
     if not SIZE_RANGE[0] <= extent <= SIZE_RANGE[1]:
         low, high = (1e3 * s for s in SIZE_RANGE)
         rule = f"the object is {extent * 1e3:.4g} mm long, must be {low:g} to {high:g} mm: scale is metres per file unit"
+        # The other unit that files have.
+        other = {0.001: 1.0, 1.0: 0.001}.get(scale)
+        if other is not None and SIZE_RANGE[0] <= extent * other / scale <= SIZE_RANGE[1]:
+            rule += f"; try {other:g} for a file in {'metres' if other == 1.0 else 'millimetres'}"
         raise MeshError(rule, file=path, key="scale", value=scale)
     return np.asarray(mesh.vertices, np.float64) * scale, np.asarray(mesh.faces, np.int32)
 

@@ -120,8 +120,13 @@ def test_what_cannot_be_pressed_gives_the_errors_of_meshes_and_scenes(tmp_path: 
     (tmp_path / "empty.stl").write_text("solid empty\nendsolid empty\n")
     with pytest.raises(MeshError, match="empty"):
         press_of(tmp_path / "empty.stl", depth=DEPTH)
-    with pytest.raises(MeshError, match="scale is metres per file unit"):
+    with pytest.raises(MeshError, match=r"scale is metres per file unit; try 0.001 for a file in millimetres"):
         press_of(part, depth=DEPTH, scale=1.0)
+    metres = trimesh.load_mesh(part)
+    metres.apply_scale(1e-3)
+    metres.export(tmp_path / "metres.stl")
+    with pytest.raises(MeshError, match=r"scale is metres per file unit; try 1 for a file in metres"):
+        press_of(tmp_path / "metres.stl", depth=DEPTH)
     for depth in (0.0, -1e-3, 1.0, float("nan")):
         with pytest.raises(SpecError, match="depth_mm"):
             press_of(part, depth=depth)
