@@ -14,8 +14,8 @@ import numpy as np
 from raytac.checks import is_number
 from raytac.errors import InputError
 from raytac.gel.components import find_edges, join_runs
+from raytac.gel.contact_shear import ContactShear
 from raytac.gel.surface import GelSurface, PadGrid, chosen_envs
-from raytac.physics.rigid.shear import ContactShear
 
 TWIST_SLIP = 3 * math.pi / 16
 """Displacement at the edge of a contact when it spins over the shear when it slides, each at its limit of sticking.

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from raytac.errors import InputError
+from raytac.gel.contact_shear import ContactShear
 from raytac.gel.surface import GelSurface, PadGrid, chosen_envs, summary
 from raytac.markers.base import MarkersConfig
 from raytac.markers.contacts import ContactCells, ContactTracker
@@ -17,7 +18,6 @@ from raytac.markers.pattern import MarkerPattern
 from raytac.markers.perturbation import MarkerPerturbation, Perturber
 from raytac.markers.registry import markers_config
 from raytac.markers.sampling import height_at
-from raytac.physics.rigid.shear import ContactShear
 from raytac.specs.sensor import SensorSpec
 
 

@@ -12,8 +12,8 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
+from raytac.gel.contact_shear import ContactShear
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.physics.rigid.shear import ContactShear
 from raytac.shapes.part import Part
 from raytac.specs.press import PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec

@@ -34,11 +34,11 @@ import numpy as np
 import warp as wp
 
 from raytac.errors import BackendError, InputError
-from raytac.physics.rigid.recorded import Recorded
 from raytac.robots.arm import Arm
 from raytac.robots.arm_kernels import Servo, servo_step
 from raytac.robots.states import StateReader
 from raytac.se3 import check_pose, pose_error
+from raytac.warp_runtime import Recorded
 
 _STRIDE = 0.1
 """Duration [s] of each step of ``reach``: at 2 rad/s, a fifth of a radian."""

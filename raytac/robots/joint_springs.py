@@ -10,10 +10,10 @@ import numpy as np
 import warp as wp
 
 from raytac.errors import InputError
-from raytac.physics.rigid.recorded import Recorded
 from raytac.robots.arm import Arm
 from raytac.robots.arm_kernels import Springs, joint_springs
 from raytac.robots.states import ControlWriter, StateReader
+from raytac.warp_runtime import Recorded
 
 _READ = ("time", "joints", "speed", "bias", "mass")
 

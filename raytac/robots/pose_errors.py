@@ -7,9 +7,8 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from raytac.physics.rigid.recorded import Recorded
-from raytac.physics.rigid.warp_cache import start_warp
 from raytac.robots.arm_kernels import pose_errors
+from raytac.warp_runtime import Recorded, start_warp
 
 
 class PoseErrors:

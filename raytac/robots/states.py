@@ -19,9 +19,8 @@ import numpy as np
 import warp as wp
 
 from raytac.errors import BackendError, InputError
-from raytac.physics.rigid.recorded import Recorded
-from raytac.physics.rigid.warp_cache import start_warp
 from raytac.robots.state_kernels import Entries, read_numbers, write_numbers
+from raytac.warp_runtime import Recorded, start_warp
 
 _CONSTANT = -1
 """Member of an entry that is its index itself, as a number."""

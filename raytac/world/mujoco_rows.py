@@ -13,8 +13,8 @@ import warp as wp
 
 from raytac.errors import InputError
 from raytac.physics.rigid.gel_contact import GelContact
-from raytac.physics.rigid.recorded import Recorded
 from raytac.physics.rigid.world_kernels import ROWS
+from raytac.warp_runtime import Recorded
 from raytac.world.implicit_damping import ImplicitDamping
 from raytac.world.mujoco_kernels import (
     Memory,

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from raytac.gel.contact_shear import ContactShear
 from raytac.gel.pierced import without_pierced
 from raytac.gel.pyramid import ElasticSurround
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.gel.traction import foundation_traction
 from raytac.physics.base import PadReading
-from raytac.physics.rigid.shear import ContactShear
 from raytac.physics.rigid.underside import Undersides
 from raytac.shapes.part import Part
 from raytac.shapes.underside import object_radius

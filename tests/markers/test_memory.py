@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from raytac.gel.contact_shear import ContactShear
 from raytac.gel.surface import GelSurface, PadGrid, make_grid
 from raytac.markers.config import Fots, FotsPublished, Superposition
 from raytac.markers.contacts import TWIST_SLIP, ContactCells, ContactTracker
 from raytac.markers.tracker import MarkerTracker
-from raytac.physics.rigid.shear import ContactShear
 from raytac.specs import BodySpec, RobotSpec, TaskScene, load_sensor
 from raytac.world.world import TactileWorld
 from tests.markers.pads import pose, pressed

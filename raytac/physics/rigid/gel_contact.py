@@ -16,11 +16,11 @@ from raytac.physics.rigid.row_kernels import read_rows, set_rows, sum_wrenches
 from raytac.physics.rigid.search import PadSearch
 from raytac.physics.rigid.shear_state import ShearState
 from raytac.physics.rigid.step_kernels import approach, choose_steps
-from raytac.physics.rigid.warp_cache import start_warp
 from raytac.shapes.part import Part
 from raytac.shapes.primitives import bounds
 from raytac.shapes.underside import object_radius
 from raytac.specs.sensor import GelpadSpec
+from raytac.warp_runtime import start_warp
 
 _AHEAD = 0.05
 """Share of the gel's thickness by which a step may go deeper on a load law that is tabulated: twice what fast bodies may (``longest``)."""

@@ -12,12 +12,11 @@ from raytac.errors import InputError
 from raytac.physics.rigid.contact_rows import LAST, Rows
 from raytac.physics.rigid.contacts import LAW_POINTS, PadContacts
 from raytac.physics.rigid.law_kernels import BINS, Sums
-from raytac.physics.rigid.recorded import LAUNCH
 from raytac.physics.rigid.search_kernels import PITCHES, Work, find_near, measure
 from raytac.physics.rigid.shape_arrays import PadArrays, ShapeArrays
-from raytac.physics.rigid.warp_cache import start_warp
 from raytac.shapes.part import Part
 from raytac.specs.sensor import GelpadSpec
+from raytac.warp_runtime import LAUNCH, start_warp
 
 _LANES = 128
 """Threads of a block on CUDA."""

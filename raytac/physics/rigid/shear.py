@@ -25,36 +25,7 @@ it turns by M = M₀ (1 − (1 − θ/θ₀)^(5/2)), θ₀ = 5 M₀ / (2 k).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import numpy as np
-
 MOST_RINGS = 48
 """Rings of a contact at most, all of one shear stiffness but the outermost."""
 LEAST_RINGS = 18
 """And at least: three quarters of what the most are when two become one."""
-
-
-@dataclass(frozen=True)
-class ContactShear:
-    """Shear of one contact of each of B pads with the body that is deepest in it, pad frame; zeros out of contact."""
-
-    stretch: np.ndarray
-    """Mean elastic displacement of the gel's skin along the pad's x and y [m], (B, 2)."""
-    spin: np.ndarray
-    """Mean elastic rotation about the normal [rad], (B,)."""
-    stuck: np.ndarray
-    """Radius of the disc that sticks over the contact's, (B,): 0 slips as a whole."""
-    centre: np.ndarray
-    """Centre of the contact [m], (B, 3)."""
-
-    def of(self, rows: np.ndarray) -> ContactShear:
-        """The same of the environments named."""
-        return ContactShear(**{name: values[rows] for name, values in vars(self).items()})
-
-    @staticmethod
-    def where(failed: np.ndarray, shear: ContactShear) -> ContactShear:
-        """``shear`` with NaN for environments that ``failed`` (B,)."""
-        return ContactShear(
-            **{name: np.where(np.reshape(failed, (-1,) + (1,) * (v.ndim - 1)), np.nan, v) for name, v in vars(shear).items()}
-        )

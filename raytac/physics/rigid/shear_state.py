@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from raytac.physics.rigid.shear import MOST_RINGS, ContactShear
+from raytac.gel.contact_shear import ContactShear
+from raytac.physics.rigid.shear import MOST_RINGS
 from raytac.physics.rigid.world_kernels import Shear
 
 

@@ -13,8 +13,8 @@ from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
 from raytac.physics.rigid.shape_arrays import ShapeArrays
 from raytac.physics.rigid.underside_kernels import Before, Nodes, join_rows, lower, place
-from raytac.physics.rigid.warp_cache import start_warp
 from raytac.shapes.part import Part
+from raytac.warp_runtime import start_warp
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ import warp as wp
 
 from raytac.physics.rigid.contacts import LoadTables, PadContacts
 from raytac.physics.rigid.gel_contact import Bodies, GelContact
-from raytac.physics.rigid.recorded import Recorded
 from raytac.physics.rigid.shear import LEAST_RINGS, MOST_RINGS
 from raytac.se3 import rotations
 from raytac.shapes.part import primitive
 from raytac.specs import load_sensor
+from raytac.warp_runtime import Recorded
 from raytac.world.forbidden_overlap import BondedFaces
 from raytac.world.gel_pairs import GelPairs
 from tests.physics.rigid.oracle_motion import PadMotion, cross, motion_of, turned

@@ -1,4 +1,4 @@
-"""Start of Warp by the rigid pad: also where another package of its name hides ``ipc``."""
+"""Start of Warp, also where another package of its name hides ``ipc``."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import sys
 import pytest
 import warp as wp
 
-from raytac.physics.rigid import warp_cache
+from raytac import warp_runtime
 
 
 def test_warp_starts_where_another_package_hides_ours(monkeypatch: pytest.MonkeyPatch) -> None:
     started: list[bool] = []
     monkeypatch.setattr(wp, "init", lambda: started.append(True))
-    monkeypatch.setattr(warp_cache, "foreign_ipc", lambda: "/elsewhere/ipc.py")
+    monkeypatch.setattr(warp_runtime, "foreign_ipc", lambda: "/elsewhere/ipc.py")
     monkeypatch.setitem(sys.modules, "ipc", None)
-    warp_cache.start_warp()
+    warp_runtime.start_warp()
     assert started
 
 
@@ -25,5 +25,5 @@ def test_a_cache_that_can_be_written_is_made_sure_of_first(monkeypatch: pytest.M
     calls: list[str] = []
     monkeypatch.setattr(ipc, "use_writable_cache", lambda: calls.append("cache"), raising=False)
     monkeypatch.setattr(wp, "init", lambda: calls.append("init"))
-    warp_cache.start_warp()
+    warp_runtime.start_warp()
     assert calls == ["cache", "init"]

@@ -1,4 +1,4 @@
-"""Launches of kernels recorded as one graph, on the CPU and on CUDA."""
+"""Warp for the package's own kernels: its start, and launches that are recorded as one graph, on the CPU and on CUDA."""
 
 from __future__ import annotations
 
@@ -8,10 +8,22 @@ from typing import Any
 
 import warp as wp
 
-from raytac.physics.rigid.warp_cache import start_warp
+from raytac.installation import foreign_ipc
 
 LAUNCH = Lock()
 """Held by a launch of kernels with tiles. On a CPU Warp keeps these in one place of the process, where two threads would meet."""
+
+
+def start_warp() -> None:
+    """``wp.init()``, with a temporary folder for compiled kernels where the user's cannot be written; ``ipc`` warns then.
+
+    Where another package hides ``ipc``, Warp takes the user's folder as it is.
+    """
+    if foreign_ipc() is None:
+        from ipc import use_writable_cache
+
+        use_writable_cache()
+    wp.init()
 
 
 class Recorded:
