@@ -28,7 +28,7 @@ def product(a: np.ndarray, b: np.ndarray, out: np.ndarray | None = None) -> np.n
 
 
 def stacked_product(a: np.ndarray, b: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-    """a @ b, float32, one of both a stack of B matrices, in pieces small enough to stay on the calling thread.
+    """a @ b, float32 or float64, one of both a stack of B matrices, in pieces small enough to stay on the calling thread.
 
     Each matrix of the stack is multiplied by itself, so that it does not matter which others there are.
     """
@@ -36,7 +36,7 @@ def stacked_product(a: np.ndarray, b: np.ndarray, out: np.ndarray | None = None)
     if rows * inner * columns <= _ONE_THREAD:
         return np.matmul(a, b, out=out)
     if out is None:
-        out = np.empty((len(a if a.ndim == 3 else b), rows, columns), np.float32)
+        out = np.empty((len(a if a.ndim == 3 else b), rows, columns), a.dtype)
     if rows >= columns:
         step = max(_ONE_THREAD // (inner * columns), 1)
         for start in range(0, rows, step):

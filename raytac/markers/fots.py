@@ -43,6 +43,7 @@ import numpy as np
 
 from raytac.gel.surface import GelSurface
 from raytac.markers.contacts import TWIST_SLIP, ContactCells, Contacts, ContactSamples, kept_shares
+from raytac.markers.sources import SourceLine, anterpolated, coarsening
 from raytac.optics.runtime import load_mitsuba, no_collection
 from raytac.specs.marker_motion import MarkerMotionSpec
 
@@ -81,11 +82,10 @@ class FotsKernel:
     def __init__(self, x: np.ndarray, y: np.ndarray, *, device: str = "auto") -> None:
         """Prepare for samples at ``x`` (nx,), ``y`` (ny,) [m], evenly spaced; errors as of ``load_mitsuba``."""
         self.mi, self.device = load_mitsuba(device)
-        self.nx, self.ny = len(x), len(y)
-        self._packets = -(-self.nx // _PACKET)
-        self._origin = float(x[0]), float(y[0])
-        self._pitch = float(x[1] - x[0]), float(y[1] - y[0])
-        self._frozen: dict[tuple[int, int, int, bool], Any] = {}
+        self._lines = x, y
+        self._area = float(x[1] - x[0]) * float(y[1] - y[0])
+        self._sources: dict[tuple[int, int], tuple[SourceLine, SourceLine]] = {}
+        self._frozen: dict[tuple[Any, ...], Any] = {}
         self._markers: tuple[np.ndarray, np.ndarray, Any] | None = None
         self._numbers: tuple[MarkerMotionSpec, Any] | None = None
 
@@ -102,21 +102,33 @@ class FotsKernel:
         """
         (batch, count), rows = markers.shape[:2], contacts.shape[1]
         k = 1 << (rows - 1).bit_length()
+        x, y = sources = self._sources_for(motion.dilate_lambda)
+        packets = -(-x.count // _PACKET)
         # Contacts, boxes and depths in one array need one upload, of whole packets. A grid's whole numbers are exact in float32.
         box, sample = batch * k * _ROW, batch * (k * _ROW + _PACKET)
-        frame = np.zeros(sample + batch * self.ny * self._packets * _PACKET, dtype=np.float32)
+        frame = np.zeros(sample + batch * y.count * packets * _PACKET, dtype=np.float32)
         frame[:box].reshape(batch, k, _ROW)[:, :rows] = contacts
-        frame[box:sample].reshape(batch, _PACKET)[:] = boxes
-        frame[sample:].reshape(batch, self.ny, -1)[..., : self.nx] = depth
+        nodes = frame[sample:].reshape(batch, y.count, -1)[..., : x.count]
+        frame[box:sample].reshape(batch, _PACKET)[:] = anterpolated(depth, boxes, x, y, nodes)
         inputs = self._on_device(markers), self.mi.Float(frame), self._constants(motion)
         is_punch = motion.punch is not None
-        key = batch, count, k, is_punch
+        key = batch, count, k, is_punch, x.factor, y.factor
         if key not in self._frozen:
             # All inputs are arrays in memory, so nothing has to be made opaque.
-            self._frozen[key] = dr.freeze(lambda *arrays: self._sums(batch, count, k, is_punch, *arrays), auto_opaque=False)
+            self._frozen[key] = dr.freeze(
+                lambda *arrays: self._sums(batch, count, k, is_punch, sources, *arrays), auto_opaque=False
+            )
         with no_collection():
             moved = self._frozen[key](*inputs)
         return moved.numpy().reshape(batch, count, 2).copy()
+
+    def _sources_for(self, decay: float) -> tuple[SourceLine, SourceLine]:
+        """Nodes along x and y that stand for the samples."""
+        x, y = self._lines
+        key = coarsening(x, decay), coarsening(y, decay)
+        if key not in self._sources:
+            self._sources[key] = SourceLine.of(x, decay), SourceLine.of(y, decay)
+        return self._sources[key]
 
     def _on_device(self, markers: np.ndarray) -> Any:
         """x and y on the device. They hardly ever change, so the upload is kept; a read-only array needs no comparison."""
@@ -138,7 +150,17 @@ class FotsKernel:
             self._numbers = motion, self.mi.Float(np.array(values, dtype=np.float32))
         return self._numbers[1]
 
-    def _sums(self, batch: int, count: int, k: int, is_punch: bool, xy: Any, frame: Any, constants: Any) -> Any:
+    def _sums(
+        self,
+        batch: int,
+        count: int,
+        k: int,
+        is_punch: bool,
+        sources: tuple[SourceLine, SourceLine],
+        xy: Any,
+        frame: Any,
+        constants: Any,
+    ) -> Any:
         """Displacements (B·M·2); ``frame``: contacts (B, k, ``_ROW``), boxes (B, 4) and depths (B, ny, packets, 4) in turn."""
         mi = self.mi
         i = dr.arange(mi.UInt32, batch * count)
@@ -147,16 +169,20 @@ class FotsKernel:
         gain, ld, *others = (dr.gather(mi.Float, constants, n) for n in range(dr.width(constants)))
         drag = _drag(mi, env, place, frame, k, others, _sticking if is_punch else _gaussian)
         box = dr.gather(mi.Vector4f, frame, batch * k * _ROW // _PACKET + env)
-        first = mi.Int32(env) * (self.ny * self._packets) + batch * (k * _ROW // _PACKET + 1)
-        dilate = self._dilate(place + drag, frame, box, first, ld) * (gain * self._pitch[0] * self._pitch[1])
+        packets = -(-sources[0].count // _PACKET)
+        first = mi.Int32(env) * (sources[1].count * packets) + batch * (k * _ROW // _PACKET + 1)
+        dilate = self._dilate(place + drag, frame, box, first, packets, sources, ld) * (gain * self._area)
         return dr.ravel(dilate + drag)
 
-    def _dilate(self, place: Any, frame: Any, box: Any, first: Any, ld: Any) -> Any:
-        """Σ Δh (M − C) exp(−λ ‖M − C‖²) over the samples of the contact's box that lie within reach of the marker.
+    def _dilate(
+        self, place: Any, frame: Any, box: Any, first: Any, packets: int, sources: tuple[SourceLine, SourceLine], ld: Any
+    ) -> Any:
+        """Σ Δh (M − C) exp(−λ ‖M − C‖²) over the nodes of the contact's box that lie within reach of the marker.
 
-        ``first``: first packet of ``frame`` with samples of the marker's pad. Samples beyond the box are 0, so whole packets are read.
+        The nodes of ``sources`` are the samples, or stand for them; those beyond the box are 0, so whole packets are read.
+        ``first``: first packet of ``frame`` with nodes of the marker's pad, ``packets`` a row.
         """
-        mi, (x0, y0), (dx, dy) = self.mi, self._origin, self._pitch
+        mi, (x0, y0), (dx, dy) = self.mi, (line.first for line in sources), (line.pitch for line in sources)
         reach = dr.sqrt(_NEGLIGIBLE / ld)
         c0, c1, r0, r1 = (mi.Int32(edge) for edge in box)
         c0, c1 = (
@@ -174,7 +200,7 @@ class FotsKernel:
             return r < r1
 
         def add(p: Any, r: Any, sx: Any, sy: Any) -> tuple[Any, ...]:
-            depths = dr.gather(mi.Vector4f, frame, first + r * self._packets + p)
+            depths = dr.gather(mi.Vector4f, frame, first + r * packets + p)
             ex, ey = place.x - (x0 + mi.Float(p * _PACKET) * dx), place.y - (y0 + mi.Float(r) * dy)
             total, along = mi.Float(0), mi.Float(0)
             # From one sample to the next the Gaussian changes by a factor, and that by a constant one: two exponentials a packet.
