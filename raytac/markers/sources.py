@@ -76,7 +76,7 @@ def coarsening(line: np.ndarray, decay: float) -> int:
 def anterpolated(depth: np.ndarray, boxes: np.ndarray, x: SourceLine, y: SourceLine, out: np.ndarray) -> np.ndarray:
     """Write depths (B, ny, nx), 0 outside ``boxes``, as nodes' (B, ``y.count``, ``x.count``), float32; returns the nodes' boxes (B, 4).
 
-    Boxes are columns from, to and rows from, to, all 0 for none; ``out`` is written where any environment has contact.
+    Boxes are columns from, to and rows from, to, all 0 for none; ``out`` is written for environments with contact, where any has it.
     """
     edges = np.stack([*x.edges(*boxes.T[:2]), *y.edges(*boxes.T[2:])], axis=1)
     some = boxes[:, 1] > boxes[:, 0]
@@ -86,10 +86,10 @@ def anterpolated(depth: np.ndarray, boxes: np.ndarray, x: SourceLine, y: SourceL
         [slice(int(box[some, low].min()), int(box[some, low + 1].max())) for box in (boxes, edges)] for low in (0, 2)
     )
     # In double precision, since the order of a product's sums depends on the piece, and so on the other environments.
-    part = depth[:, rows, columns].astype(float)
+    part = depth[some, rows, columns].astype(float)
     if y.weights is not None:
         part = stacked_product(y.weights[y_nodes, rows], part)
     if x.weights is not None:
         part = stacked_product(part, x.turned[columns, x_nodes])
-    out[:, y_nodes, x_nodes] = part
+    out[some, y_nodes, x_nodes] = part
     return edges
