@@ -5,9 +5,15 @@ from .batch import StepResult as StepResult
 from .batch import TaskBatch as TaskBatch
 from .environments import TactileEnv as TactileEnv
 from .environments import TactileVectorEnv as TactileVectorEnv
+from .insert_peg import InsertPeg as InsertPeg
+from .insert_peg import InsertPegEnv as InsertPegEnv
+from .insert_peg import InsertPegVectorEnv as InsertPegVectorEnv
 from .lift_cube import LiftCube as LiftCube
 from .lift_cube import LiftCubeEnv as LiftCubeEnv
 from .lift_cube import LiftCubeVectorEnv as LiftCubeVectorEnv
+from .open_drawer import OpenDrawer as OpenDrawer
+from .open_drawer import OpenDrawerEnv as OpenDrawerEnv
+from .open_drawer import OpenDrawerVectorEnv as OpenDrawerVectorEnv
 from .push_cube import PushCube as PushCube
 from .push_cube import PushCubeEnv as PushCubeEnv
 from .push_cube import PushCubeVectorEnv as PushCubeVectorEnv

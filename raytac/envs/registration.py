@@ -11,7 +11,14 @@ try:
 except ModuleNotFoundError as error:
     raise BackendError("Gymnasium is not installed: pip install 'raytac[rl]'") from error
 
-_MODULES: Final = {"PushCube": "push_cube", "BalancePole": "balance_pole", "LiftCube": "lift_cube", "RollBall": "roll_ball"}
+_MODULES: Final = {
+    "PushCube": "push_cube",
+    "BalancePole": "balance_pole",
+    "LiftCube": "lift_cube",
+    "RollBall": "roll_ball",
+    "InsertPeg": "insert_peg",
+    "OpenDrawer": "open_drawer",
+}
 IDS: Final = tuple(f"raytac/{name}-v0" for name in _MODULES)
 """Names that ``gymnasium.make`` and ``gymnasium.make_vec`` take once ``raytac.envs`` is imported."""
 

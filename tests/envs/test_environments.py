@@ -17,8 +17,10 @@ import raytac.envs
 import raytac.envs.lift_cube
 from raytac.envs import (
     BalancePoleEnv,
+    InsertPegEnv,
     LiftCubeEnv,
     LiftCubeVectorEnv,
+    OpenDrawerEnv,
     PushCubeEnv,
     PushCubeVectorEnv,
     RollBallEnv,
@@ -27,6 +29,8 @@ from raytac.envs import (
 )
 from raytac.envs.balance_pole import BalancePole
 from raytac.envs.batch import TaskBatch
+from raytac.envs.insert_peg import SOCKET, InsertPeg
+from raytac.envs.open_drawer import OpenDrawer
 from raytac.envs.push_cube import PushCube
 from raytac.envs.roll_ball import RollBall
 from raytac.errors import InputError
@@ -34,7 +38,7 @@ from raytac.markers import MarkerPerturbation
 from raytac.observe import ObservationSettings, Randomization
 from raytac.optics import RayTraced
 
-ENVS = (PushCubeEnv, BalancePoleEnv, LiftCubeEnv, RollBallEnv)
+ENVS = (PushCubeEnv, BalancePoleEnv, LiftCubeEnv, RollBallEnv, InsertPegEnv, OpenDrawerEnv)
 
 
 def equal(a: dict, b: dict) -> bool:
@@ -259,7 +263,13 @@ def test_a_pole_that_is_left_alone_falls_and_the_episode_ends() -> None:
 
 
 @pytest.mark.parametrize(
-    ("task", "policy", "steps"), [(RollBall, scripted.roll_ball, 60), (BalancePole, scripted.balance_pole, 120)]
+    ("task", "policy", "steps"),
+    [
+        (RollBall, scripted.roll_ball, 60),
+        (BalancePole, scripted.balance_pole, 120),
+        (InsertPeg, scripted.insert_peg, 180),
+        (OpenDrawer, scripted.open_drawer, 120),
+    ],
 )
 def test_the_task_can_be_done(task: type, policy, steps: int) -> None:
     batch = TaskBatch(task(), num_envs=2, tactile=None)
@@ -268,6 +278,20 @@ def test_the_task_can_be_done(task: type, policy, steps: int) -> None:
         out = batch.step(policy(batch))
         assert not out.terminated.any()
     assert out.success.all()
+
+
+def test_a_peg_beside_its_socket_stays_outside_and_the_gels_feel_the_rim(monkeypatch: pytest.MonkeyPatch) -> None:
+    batch = TaskBatch(InsertPeg(), num_envs=2, tactile=None)
+    batch.reset([0, 1], [np.random.default_rng(b) for b in range(2)])
+    monkeypatch.setattr(scripted, "SOCKET", np.add(SOCKET, [1e-3, 0.0]))
+    upward, overlap = np.zeros(2), 0.0
+    for _ in range(150):
+        out = batch.step(scripted.insert_peg(batch))
+        wrench = batch.world.state().wrench
+        upward = np.maximum(upward, -(wrench["left"] + wrench["right"])[:, 1])  # y of both pads is down
+        overlap = max(overlap, *(-data.contact.dist.min(initial=0.0) for data in batch.world.data))
+        assert not out.success.any() and not out.failed.any()
+    assert (upward > 5.0).all() and overlap < 2e-4
 
 
 @pytest.mark.slow
