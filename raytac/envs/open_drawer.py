@@ -11,7 +11,7 @@ from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, d
 from raytac.se3 import pose
 
 HANDLE = np.array([-0.09, 0.0, 0.034])
-"""Where a gripper holds the handle, drawer frame [m]."""
+"""Place at which a gripper holds the handle, drawer frame [m]."""
 
 
 class OpenDrawer(Task):
