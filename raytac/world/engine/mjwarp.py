@@ -1,0 +1,298 @@
+"""MuJoCo Warp under rigid pads: B worlds in one state, on the CPU or on CUDA, with the contacts of gels in its contact list.
+
+Nothing in a step waits for the device, so that a step can be recorded as one CUDA graph (``capture``). All worlds take steps of one
+length, and none can be left out: one that is not active, or breaks down, is put back to where the step began.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import copy
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from raytac.errors import BackendError, InputError
+from raytac.physics.rigid.motion_kernels import Frames
+from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
+from raytac.warp_runtime import start_warp
+from raytac.world.engine import mjwarp_kernels as kernels
+from raytac.world.implicit_damping import ImplicitDamping
+
+_SLIDES = 2
+"""Solves for the lift of a slide that begins or ends, before that of the step."""
+_TOLERANCE = 1e-8
+"""Of the solver, over the trace of the mass matrix. With MuJoCo Warp's own 1e-6 it stops before the forces on a cube of 50 g that an arm
+pushes are in balance."""
+_VARIED = (
+    "body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0", "body_pos", "body_quat", "geom_friction",
+)  # fmt: skip
+"""What a variation changes in MuJoCo's model, with what follows from it."""
+
+
+class MujocoWarp:
+    """States of B environments of one model, and the steps between which pads act.
+
+    A step is ``begin_step``, controls, ``free_acceleration``, ``read_frames``, ``put_contacts``, ``end_step``, ``read_rows``.
+
+    Attributes:
+        num_envs: B.
+        device: of all arrays.
+        timestep: of all steps [s].
+        model, data: MuJoCo Warp's.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        *,
+        num_envs: int,
+        sites: np.ndarray,
+        bodies: np.ndarray,
+        geoms: np.ndarray,
+        hard: np.ndarray,
+        timestep: float | None = None,
+        contacts: int | None = None,
+        rows: int | None = None,
+        device: str = "cpu",
+    ) -> None:
+        """Make the states, all at ``qpos0``.
+
+        Args:
+            model: of all environments; ``set_models`` gives them their own.
+            num_envs: B.
+            sites: at the pads' frames, (pads,).
+            bodies: that carry the pads, then those that they touch.
+            geoms: of the bodies that pads touch, then of the gels.
+            hard: geoms with the law of ``hard_contacts``, (ngeom,), bool.
+            timestep: of all steps [s]; None is the model's.
+            contacts, rows: memory for contacts and constraint rows, an environment each; None is a guess. All environments share the
+                memory for contacts. If it is too small, ``check_overflow`` raises an error.
+            device: "cpu" or "cuda".
+
+        Raises:
+            BackendError: MuJoCo Warp is not installed.
+            InputError: an option of the model or a part of it that MuJoCo Warp has not, or with which pads cannot act.
+        """
+        start_warp()
+        self._mjw = mjw = _mujoco_warp()
+        self.num_envs, self.device = num_envs, wp.get_device(device)
+        model = _checked(model)
+        if timestep is not None:
+            model.opt.timestep = timestep
+        self.timestep = float(model.opt.timestep)
+        pads, touched = len(sites), len(geoms)
+        self._contacts = 24 + 2 * pads * touched + 4 * touched if contacts is None else contacts
+        self._rows = 4 * self._contacts if rows is None else rows
+        self._damped = ImplicitDamping(model).matters
+        with wp.ScopedDevice(self.device):
+            sizes = {name: num_envs for name in _VARIED if getattr(model, name).size}
+            try:
+                self.model: Any = mjw.put_model(model, batch_sizes=sizes)
+            except (NotImplementedError, ValueError) as error:
+                raise InputError("model", value=model, rule=f"is refused by MuJoCo Warp: {' '.join(str(error).split())}") from error
+            self.data: Any = mjw.make_data(model, nworld=num_envs, nconmax=self._contacts, njmax=self._rows)
+            self._use_gel_contacts()
+            self._worlds = _worlds(self.model, self.data)
+            shape = num_envs, pads, touched
+            self._own: Any = kernels.Own()
+            self._own.first, self._own.sliding = wp.zeros(1, dtype=wp.int32), wp.zeros(num_envs, dtype=wp.int32)
+            self._own.contact, self._own.scale = wp.full(shape, -1, dtype=wp.int32), wp.zeros(shape, dtype=wp.float64)
+            self._saved: Any = kernels.Saved()
+            for name in ("time", "qpos", "qvel", "act"):
+                setattr(self._saved, name, wp.clone(getattr(self.data, name)))
+            self._saved.warmstart = wp.clone(self.data.qacc_warmstart)
+            self._mass, self._damped_mass = wp.empty_like(self.data.M), wp.empty_like(self.data.M)
+            self._peaks = wp.zeros(3, dtype=wp.int32)
+            last = np.array([_last_dof(model, body) for body in bodies.tolist()])
+            self._sites, self._bodies, self._last = (_array(values) for values in (sites, bodies, last))
+            self._gels, self._others, self._hard = _array(geoms[touched - pads :]), _array(geoms), _array(hard)
+        self._mujoco_model = model
+
+    def _use_gel_contacts(self) -> None:
+        """Room for contacts of ``ROWS`` rows, which the model's own geoms may not have."""
+        model, data = self.model, self.data
+        if model.nmaxcondim < ROWS:
+            model.nmaxcondim, model.nmaxpyramid = ROWS, 2 * (ROWS - 1)
+            data.contact.efc_address = wp.full((data.naconmax, model.nmaxpyramid), -1, dtype=wp.int32)
+        model.opt.warn_overflow = 0  # check_overflow raises an error
+        model.opt.tolerance.fill_(_TOLERANCE)
+
+    def begin_step(self) -> None:
+        """Positions, collision and velocities, as ``mj_step1`` but for constraints."""
+        mjw, m, d = self._mjw, self.model, self.data
+        with wp.ScopedDevice(self.device):
+            wp.launch(kernels.save_states, dim=self.num_envs, inputs=[self._worlds, self._saved])
+            # Constraints are made once, with those of the gels.
+            flags, none = m.opt.disableflags, int(mjw.DisableBit.CONSTRAINT)
+            m.opt.disableflags = flags | none
+            mjw.fwd_position(m, d)
+            m.opt.disableflags = flags
+            mjw.collision(m, d)
+            mjw.fwd_velocity(m, d)
+
+    def free_acceleration(self) -> None:
+        """Accelerations that everything but contacts and other constraints would give, by the controls."""
+        with wp.ScopedDevice(self.device):
+            self._mjw.fwd_actuation(self.model, self.data)
+            self._mjw.fwd_acceleration(self.model, self.data)
+
+    def choose(self, active: wp.array, steps: Steps) -> None:
+        """Name the environments of this step, those that are ``active`` (B,), bool."""
+        self._launch(kernels.choose_worlds, self.num_envs, [active, steps])
+
+    def read_frames(self, frames: Frames) -> None:
+        """Frames of pads and bodies, after ``free_acceleration``."""
+        shape = self.num_envs, len(self._bodies)
+        self._launch(kernels.read_frames, shape, [self._worlds, self._sites, self._bodies, self._last, frames])
+
+    def put_contacts(self, slots: Slots, steps: Steps) -> None:
+        """Put the contacts that ``GelContact.begin`` chose among MuJoCo's own, make all constraints, and solve for the lifts of slides."""
+        worlds, own, mjw = self._worlds, self._own, self._mjw
+        with wp.ScopedDevice(self.device):
+            if self._damped:
+                self._add_damping(steps)
+            wp.copy(own.first, self.data.nacon)
+            self._launch(kernels.append_contacts, own.contact.shape, [worlds, steps, slots, self._gels, self._others, own])
+            mjw.make_constraint(self.model, self.data)
+            hard = [worlds, own, self._hard, self.model.opt.timestep]
+            self._launch(kernels.write_hard_references, self.data.naconmax, hard)
+            self._launch(kernels.write_rows, own.contact.shape, [worlds, steps, slots, own])
+            for _ in range(_SLIDES):
+                mjw.solve(self.model, self.data)
+                self._launch(kernels.begin_correction, self.num_envs, [worlds, steps, own])
+                self._launch(kernels.correct_lifts, own.contact.shape, [worlds, own, steps, slots])
+
+    def _add_damping(self, steps: Steps) -> None:
+        model, data = self.model, self.data
+        self._mjw.deriv_smooth_vel(model, data, self._damped_mass)
+        self._launch(kernels.add_damping, self._mass.shape, [self._worlds, steps, self._damped_mass, self._mass])
+        self._mjw.factor_m(model, data)
+        self._mjw.solve_m(model, data, data.qacc_smooth, data.qfrc_smooth)
+
+    def end_step(self, steps: Steps) -> None:
+        """Solve and integrate."""
+        with wp.ScopedDevice(self.device):
+            self._mjw.solve(self.model, self.data)
+            if self._damped:
+                wp.copy(self.data.M, self._mass)
+            self._mjw.implicit(self.model, self.data)
+            self._launch(kernels.end_states, self.num_envs, [self._worlds, self._saved, steps, self._peaks])
+
+    def read_rows(self, steps: Steps, force: wp.array, velocity: wp.array) -> None:
+        """Forces of the gels' rows and their velocities at the end of the step."""
+        self._launch(kernels.read_rows, self._own.contact.shape, [self._worlds, self._own, steps, force, velocity])
+
+    def update_poses(self) -> None:
+        """Poses at the present positions."""
+        with wp.ScopedDevice(self.device):
+            self._mjw.kinematics(self.model, self.data)
+
+    def capture(self, step: Callable[[], None]) -> Callable[[], None]:
+        """A function that does what ``step`` launches, as one graph on CUDA; ``step`` runs once before. On the CPU ``step`` itself."""
+        step()
+        if self.device.is_cpu:
+            return step
+        with wp.ScopedDevice(self.device), wp.ScopedCapture() as capture:
+            step()
+        graph: Any = capture.graph
+        return lambda: wp.capture_launch(graph)
+
+    def set_models(self, models: Sequence[mujoco.MjModel]) -> None:
+        """Give environments the masses, friction and mounting of their own models, one each."""
+        for name in _VARIED:
+            values = np.stack([getattr(one, name) for one in models])
+            if values.size:
+                array = getattr(self.model, name)
+                array.assign(values.astype(np.float32).reshape(array.numpy().shape))
+
+    def set_states(self, qpos: np.ndarray, qvel: np.ndarray | None = None) -> None:
+        """Put all environments to positions (B, nq) and velocities (B, nv), at the time 0."""
+        with wp.ScopedDevice(self.device):
+            self._mjw.reset_data(self.model, self.data)
+            self.data.qpos.assign(np.asarray(qpos, np.float32))
+            if qvel is not None:
+                self.data.qvel.assign(np.asarray(qvel, np.float32))
+
+    def check_overflow(self) -> None:
+        """Raise ``InputError`` if contacts or rows were lost since the states were made; it waits for the device."""
+        overflow = int(np.bitwise_or.reduce(self.data.overflow.numpy()))
+        lost = [one for one in self._mjw.OverflowType if one & overflow and one.name in _LOST]
+        if not lost:
+            return
+        contacts, pairs, rows = self._peaks.numpy().tolist()
+        most = max(contacts, pairs)
+        if most > self.data.naconmax:
+            least = -(-most // self.num_envs)
+            raise InputError("contacts", value=self._contacts, rule=f"must be {least} or more: contacts of an environment were lost")
+        if rows > self.data.njmax:
+            raise InputError("rows", value=self._rows, rule=f"must be {rows} or more: constraint rows of an environment were lost")
+        names = ", ".join(str(one.name) for one in lost)
+        raise InputError("contacts", value=self._contacts, rule=f"must be more: MuJoCo Warp has lost contacts ({names})")
+
+    def _launch(self, kernel: Any, dim: Any, inputs: Sequence[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=list(inputs), device=self.device)
+
+
+_LOST = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "HFIELD")
+"""Overflows of MuJoCo Warp by which contacts are lost."""
+
+
+def _mujoco_warp() -> Any:
+    try:
+        import mujoco_warp
+    except ImportError as error:
+        raise BackendError("worlds on a GPU need MuJoCo Warp: pip install 'raytac[gpu]'") from error
+    return mujoco_warp
+
+
+def _checked(model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy of a model for MuJoCo Warp, which has no automatic reset."""
+    if model.opt.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:
+        raise InputError("model.opt.cone", value="pyramidal", rule="must be elliptic, since a gel sticks by its shear")
+    if model.opt.integrator != mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
+        name = mujoco.mjtIntegrator(model.opt.integrator).name[len("mjINT_") :].lower()
+        raise InputError("model.opt.integrator", value=name, rule="must be implicitfast on MuJoCo Warp")
+    result = copy(model)
+    result.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    return result
+
+
+def _worlds(model: Any, data: Any) -> Any:
+    """MuJoCo Warp's arrays as the kernels take them."""
+    result: Any = kernels.Worlds()
+    result.sparse, result.nv = int(model.is_sparse), model.nv
+    result.body_rootid, result.dof_parentid = model.body_rootid, model.dof_parentid
+    result.impratio_invsqrt = model.opt.impratio_invsqrt
+    for name in _DATA:
+        setattr(result, name, getattr(data, name))
+    for name in _CONTACT:
+        setattr(result, name, getattr(data.contact, name))
+    for name in ("rownnz", "rowadr", "colind"):
+        setattr(result, name, getattr(data.efc, f"J_{name}"))
+    for name in ("J", "D", "vel", "aref", "force"):
+        setattr(result, name, getattr(data.efc, name))
+    return result
+
+
+def _last_dof(model: mujoco.MjModel, body: int) -> int:
+    """Last degree of freedom that moves a body; −1 of one that stands still."""
+    while body and not model.body_dofnum[body]:
+        body = int(model.body_parentid[body])
+    return int(model.body_dofadr[body] + model.body_dofnum[body]) - 1 if body else -1
+
+
+def _array(values: np.ndarray) -> wp.array:
+    return wp.array(np.asarray(values, np.int32), dtype=wp.int32)
+
+
+_DATA = (
+    "time", "qpos", "qvel", "act", "qacc", "qacc_smooth", "qacc_warmstart", "M", "xpos", "xmat", "site_xpos", "site_xmat", "subtree_com",
+    "cvel", "cdof", "nacon", "ncollision", "nefc",
+)  # fmt: skip
+_CONTACT = (
+    "dist", "pos", "frame", "includemargin", "friction", "solref", "solreffriction", "solimp", "dim", "geom", "flex",
+    "efc_address", "worldid", "type", "geomcollisionid", "adhesion", "surfacevel",
+)  # fmt: skip
