@@ -6,8 +6,9 @@ length, and none can be left out: one that is not active, or breaks down, is put
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -17,6 +18,7 @@ import warp as wp
 from raytac.errors import BackendError, InputError
 from raytac.physics.rigid.motion_kernels import Frames
 from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
+from raytac.robots.states import Numbers
 from raytac.warp_runtime import start_warp
 from raytac.world.engine import mjwarp_kernels as kernels
 from raytac.world.implicit_damping import ImplicitDamping
@@ -42,6 +44,7 @@ class MujocoWarp:
         device: of all arrays.
         timestep: of all steps [s].
         model, data: MuJoCo Warp's.
+        peaks: most contacts of all environments at once, most pairs of its collision, and most rows of one environment, (3,).
     """
 
     def __init__(
@@ -105,7 +108,7 @@ class MujocoWarp:
                 setattr(self._saved, name, wp.clone(getattr(self.data, name)))
             self._saved.warmstart = wp.clone(self.data.qacc_warmstart)
             self._mass, self._damped_mass = wp.empty_like(self.data.M), wp.empty_like(self.data.M)
-            self._peaks = wp.zeros(3, dtype=wp.int32)
+            self.peaks = wp.zeros(3, dtype=wp.int32)
             last = np.array([_last_dof(model, body) for body in bodies.tolist()])
             self._sites, self._bodies, self._last = (_array(values) for values in (sites, bodies, last))
             self._gels, self._others, self._hard = _array(geoms[touched - pads :]), _array(geoms), _array(hard)
@@ -179,7 +182,7 @@ class MujocoWarp:
             if self._damped:
                 wp.copy(self.data.M, self._mass)
             self._mjw.implicit(self.model, self.data)
-            self._launch(kernels.end_states, self.num_envs, [self._worlds, self._saved, steps, self._peaks])
+            self._launch(kernels.end_states, self.num_envs, [self._worlds, self._saved, steps, self.peaks])
 
     def read_rows(self, steps: Steps, force: wp.array, velocity: wp.array) -> None:
         """Forces of the gels' rows and their velocities at the end of the step."""
@@ -189,6 +192,14 @@ class MujocoWarp:
         """Poses at the present positions."""
         with wp.ScopedDevice(self.device):
             self._mjw.kinematics(self.model, self.data)
+
+    def reader(self, members: Mapping[str, Numbers]) -> NumberReader:
+        """Reader of numbers of all environments, which are named as those of C MuJoCo's states."""
+        return NumberReader(self.data, members, self.num_envs, self.device)
+
+    def write_controls(self, actuators: wp.array, values: wp.array) -> None:
+        """Set the controls of ``actuators`` (n,), int32, to ``values`` (B, n)."""
+        self._launch(kernels.write_controls, values.shape, [actuators, values, self.data.ctrl])
 
     def capture(self, step: Callable[[], None]) -> Callable[[], None]:
         """A function that does what ``step`` launches, as one graph on CUDA; ``step`` runs once before. On the CPU ``step`` itself."""
@@ -222,7 +233,7 @@ class MujocoWarp:
         lost = [one for one in self._mjw.OverflowType if one & overflow and one.name in _LOST]
         if not lost:
             return
-        contacts, pairs, rows = self._peaks.numpy().tolist()
+        contacts, pairs, rows = self.peaks.numpy().tolist()
         most = max(contacts, pairs)
         if most > self.data.naconmax:
             least = -(-most // self.num_envs)
@@ -234,6 +245,46 @@ class MujocoWarp:
 
     def _launch(self, kernel: Any, dim: Any, inputs: Sequence[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=list(inputs), device=self.device)
+
+
+class NumberReader:
+    """Numbers of B environments in float64, read together.
+
+    Attributes:
+        arrays: Warp arrays (B, …) by name; they are overwritten by the next ``read``.
+    """
+
+    def __init__(self, data: Any, members: Mapping[str, Numbers], num_envs: int, device: Any) -> None:
+        """Look up where ``members`` lie in MuJoCo Warp's ``data``; nothing is read yet."""
+        names = sorted({name for one in members.values() for name in one.name if name})
+        self._sources = [getattr(data, name) for name in names]  # they are read by their addresses
+        member, index, start, stride, size = [], [], [], [], 0
+        shapes: dict[str, tuple[int, tuple[int, ...]]] = {}
+        for key, one in members.items():
+            width = len(one.index)
+            member += [names.index(name) if name else -1 for name in one.name]
+            index += one.index
+            start += range(size, size + width)
+            stride += [width] * width
+            shapes[key] = size, (num_envs, *one.shape)
+            size += num_envs * width
+        self._flat = wp.zeros(size, dtype=wp.float64, device=device)
+        self.arrays: dict[str, wp.array] = {
+            key: wp.array(ptr=self._flat.ptr + 8 * at, shape=shape, dtype=wp.float64, device=device)
+            for key, (at, shape) in shapes.items()
+        }
+        entries: Any = kernels.Entries()
+        entries.arrays = wp.array([array.ptr for array in self._sources], dtype=wp.uint64, device=device)
+        # MuJoCo Warp's vectors and matrices are float32 one after the other.
+        widths = [array.strides[0] // 4 for array in self._sources]
+        for name, column in (("width", widths), ("member", member), ("index", index), ("start", start), ("stride", stride)):
+            setattr(entries, name, wp.array(column, dtype=wp.int32, device=device))
+        entries.values = self._flat
+        self._launch = partial(wp.launch, kernels.read_numbers, dim=(num_envs, len(index)), inputs=[entries], device=device)
+
+    def read(self) -> None:
+        """Copy all numbers to ``arrays``."""
+        self._launch()
 
 
 _LOST = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "HFIELD")

@@ -34,6 +34,7 @@ _LARGEST_SPEED = wp.constant(wp.float32(LARGEST_SPEED))
 _IMPEDANCE = wp.constant(wp.float32(0.9))
 _CONSTRAINT = wp.constant(wp.int32(1))
 """Type of a contact that the solver takes."""
+_MANY = wp.constant(0x7FFFFFFF)
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
 
@@ -427,3 +428,38 @@ def read_rows(
             t = wp.where(is_scaled(m), own.scale[i, pad, body], _1)
             force[i, pad, body, m] = t * wp.float64(worlds.force[i, row])
             velocity[i, pad, body, m] = row_times(worlds, i, row, worlds.qvel) / t
+
+
+@wp.struct
+class Entries:
+    """Places of numbers in the arrays of all environments, and in the result."""
+
+    arrays: wp.array(dtype=wp.uint64)
+    """Address of each array of float32 that is read, (members,)."""
+    width: wp.array(dtype=wp.int32)
+    """Its numbers of one environment."""
+    member: wp.array(dtype=wp.int32)
+    """Of every entry; negative: the index itself is the number."""
+    index: wp.array(dtype=wp.int32)
+    start: wp.array(dtype=wp.int32)
+    stride: wp.array(dtype=wp.int32)
+    """With ``start``, place of the entry of environment b: start + stride b."""
+    values: wp.array(dtype=wp.float64)
+
+
+@wp.kernel
+def read_numbers(entries: Entries):
+    """Copy entries of the arrays of B environments to ``values``."""
+    i, k = wp.tid()
+    value, member = wp.float64(entries.index[k]), entries.member[k] + 0
+    if member >= 0:
+        source = wp.array(ptr=entries.arrays[member], shape=(_MANY,), dtype=wp.float32)
+        value = wp.float64(source[i * entries.width[member] + entries.index[k]])
+    entries.values[entries.start[k] + i * entries.stride[k]] = value
+
+
+@wp.kernel
+def write_controls(index: wp.array(dtype=wp.int32), values: wp.array2d(dtype=wp.float64), ctrl: wp.array2d(dtype=wp.float32)):
+    """Copy ``values`` (B, n) to the controls ``index`` (n,)."""
+    i, k = wp.tid()
+    ctrl[i, index[k]] = wp.float32(values[i, k])

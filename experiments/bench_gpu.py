@@ -1,0 +1,282 @@
+"""How many environment steps a second does physics alone make on MuJoCo Warp? PushCube, with the pads pressed on the cubes.
+
+    python experiments/bench_gpu.py --worlds 4096 --steps 200 --device cuda --out runs/bench_gpu
+
+Each arm presses its pad onto the cube and drags it along a circle: joint targets are recorded in one environment of C MuJoCo, and every
+world follows them by springs in its joints, with its cube up to 4 mm and 0.2 rad from where that of the record started. An environment step
+is a control step of 20 ms with ``--substeps`` steps of MuJoCo; on CUDA all of it is one graph. ``pressed`` says in how many of the steps
+that are timed a world's pad carried at least 0.1 N.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from experiments.running import recorded, run
+from raytac.device import resolve_device
+from raytac.errors import InputError
+from raytac.io import CommonOptions, Metric
+from raytac.physics.rigid.gel_contact import Bodies, GelContact
+from raytac.report import machine
+from raytac.robots.arm_kernels import Springs, joint_springs
+from raytac.robots.ik import PoseServo
+from raytac.robots.impedance import JointImpedance
+from raytac.robots.panda import MAX_VELOCITY
+from raytac.specs import load_task
+from raytac.world.engine.mjwarp import MujocoWarp
+from raytac.world.gel_pairs import GelPairs
+from raytac.world.hard_contacts import HARD_MARGIN, is_hard
+from raytac.world.world import TactileWorld
+
+PRESS, CIRCLE = 20, 150
+"""Control steps in which the pad is pressed on, and of one turn."""
+DEPTH, RADIUS = 2.9e-3, 0.015
+"""Path down from 2 mm above the cube, and radius of the circle [m]."""
+FREQUENCY = 30.0
+"""Of the springs in the joints [rad/s]."""
+LEAST_FORCE = 0.1
+"""Of a pad that is pressed [N]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Args(CommonOptions):
+    """Control steps of worlds in one state of MuJoCo Warp."""
+
+    worlds: int = 512
+    """Number of environments."""
+    steps: int = 200
+    """Control steps that are timed, after those in which the pads are pressed on."""
+    substeps: int = 2
+    """Steps of MuJoCo in a control step."""
+    contacts: int | None = None
+    """Memory for contacts of each environment; None is a guess."""
+    rows: int | None = None
+    """Memory for constraint rows of each environment; None is a guess."""
+
+
+@wp.kernel
+def next_targets(
+    joints: wp.array2d(dtype=wp.float64),
+    speeds: wp.array2d(dtype=wp.float64),
+    press: wp.int32,
+    counter: wp.array(dtype=wp.int32),
+    time: wp.array(dtype=wp.float64),
+    # outputs
+    springs: Springs,
+):
+    """Targets of this control step, from tables (steps, n): those after ``press`` again and again."""
+    i, k = wp.tid()
+    row = counter[0] + 0
+    if row >= press:
+        row = press + (row - press) % (joints.shape[0] - press)
+    springs.target[i, k] = joints[row, k]
+    springs.target_speed[i, k] = speeds[row, k]
+    springs.start[i] = time[i]
+
+
+@wp.kernel
+def count_pressed(wrenches: wp.array2d(dtype=wp.spatial_vectord), least: wp.float64, counts: wp.array(dtype=wp.int32)):
+    """Add up pads that are pressed."""
+    i = wp.tid()
+    if -wrenches[i, 0][2] >= least:
+        wp.atomic_add(counts, 0, 1)
+
+
+@wp.kernel
+def count_step(counter: wp.array(dtype=wp.int32)):
+    counter[0] = counter[0] + 1
+
+
+def main(args: Args) -> dict[str, Metric]:
+    """Run it and write ``metrics.json``."""
+    for name in ("worlds", "steps", "substeps"):
+        if getattr(args, name) < 1:
+            raise InputError(name, value=getattr(args, name), rule="must be 1 or more")
+    device = resolve_device(args.device, ray_tracing=False)
+    with recorded(args, "bench_gpu", device=device, owned=("metrics.json",), packages=("mujoco-warp", "warp-lang")) as (_, metrics):
+        metrics |= {"worlds": args.worlds, "steps": args.steps, "substeps": args.substeps, **machine()}
+        found = timed(args, device)
+        where = "gpu" if device == "cuda" else "cpu"
+        metrics |= {f"{where}.push.physics.{key}": value for key, value in found.items()}
+        for key, value in found.items():
+            print(f"{key}: {value:.6g}")
+    return metrics
+
+
+def timed(args: Args, device: str) -> dict[str, Metric]:
+    """Keys of the benchmark."""
+    scene = load_task("push_cube")
+    scene = replace(scene, timestep=scene.control_timestep / args.substeps)
+    world = TactileWorld(scene, outputs=())
+    joints, speeds = record(world)
+    begin, where = time.perf_counter(), wp.get_device(device)
+    free = where.free_memory if where.is_cuda else 0
+    bench = Worlds(world, args, device, joints, speeds)
+    step = bench.engine.capture(bench.control_step)
+    for _ in range(PRESS + CIRCLE // 5):
+        step()
+    wp.synchronize_device(where)
+    prepared = time.perf_counter() - begin
+    bench.counts.zero_()
+    begin = time.perf_counter()
+    for _ in range(args.steps):
+        step()
+    wp.synchronize_device(where)
+    wall = time.perf_counter() - begin
+    bench.engine.check_overflow()
+    pressed = int(bench.counts.numpy()[0])
+    lost = int((bench.contact.steps.lost.numpy() != 0).sum())
+    finite = bool(np.isfinite(bench.engine.data.qpos.numpy()).all())
+    peaks = bench.engine.peaks.numpy().tolist()
+    return {
+        "env_steps_per_s": args.worlds * args.steps / wall,
+        "ms_per_step": 1e3 * wall / args.steps,
+        "pressed": pressed / (args.worlds * args.steps),
+        "lost": lost,
+        "finite": int(finite),
+        "contacts_per_world": peaks[0] / args.worlds,
+        "pairs_per_world": peaks[1] / args.worlds,
+        "most_rows": peaks[2],
+        "memory_gb": (free - where.free_memory) / 1e9 if where.is_cuda else 0.0,
+        "prepared_s": prepared,
+    }
+
+
+def record(world: TactileWorld) -> tuple[np.ndarray, np.ndarray]:
+    """Joint targets (steps, n) and their speeds with which the pad is pressed on and goes round."""
+    arm, dt = world.arm, world.control_timestep
+    assert arm is not None
+    servo = PoseServo(arm, max_velocity=np.array(MAX_VELOCITY), posture=world.composed.start[arm.qpos])
+    springs = JointImpedance(arm, frequency=FREQUENCY).springs(world.data)
+    start = arm.world_from_site(world.data[0])
+    follow = _follow(springs)
+    joints, speeds = [], []
+    for k in range(PRESS + CIRCLE):
+        before, after = (pose_at(start, m) for m in (k, k + 1))
+        twist = np.concatenate([(after - before)[None, :3, 3] / dt, np.zeros((1, 3))], axis=1)
+        target, speed = servo.targets(world.data, before[None], twist, dt)
+        joints.append(target[0].copy())
+        speeds.append(speed[0].copy())
+        springs.aim(target, speed, np.array([data.time for data in world.data]))
+        world.step(follow)
+    if world.failed.any():
+        raise InputError("record", value="failed", rule="must run through in C MuJoCo")
+    return np.array(joints), np.array(speeds)
+
+
+def _follow(springs: Any) -> Any:
+    from raytac.world.world_state import BatchController
+
+    class Follow(BatchController):
+        def drive(self, datas: Any, envs: Any) -> None:
+            springs.drive(envs)
+
+    return Follow()
+
+
+def pose_at(start: np.ndarray, step: int) -> np.ndarray:
+    """Pose (4, 4) of the pad at the start of a control step."""
+    pose = start.copy()
+    pose[2, 3] -= DEPTH * min(step / PRESS, 1.0)
+    angle = 2.0 * np.pi * max(step - PRESS, 0) / CIRCLE
+    pose[:2, 3] += RADIUS * np.array([np.sin(angle), 1.0 - np.cos(angle)])
+    return pose
+
+
+class Worlds:
+    """Worlds on MuJoCo Warp, and what happens in a control step."""
+
+    def __init__(self, world: TactileWorld, args: Args, device: str, joints: np.ndarray, speeds: np.ndarray) -> None:
+        composed, model, count = world.composed, world.model, args.worlds
+        assert world.arm is not None and world.arm.motors is not None
+        gels = tuple(spec.gelpad for spec in composed.sensor_specs)
+        bodies = np.array([body.index for body in composed.touched])
+        pads = np.array([model.body(mounted.body).id for mounted in composed.sensors])
+        cases = [model.geom(mounted.case).id for mounted in composed.sensors]
+        geoms = [body.geoms[0] for body in composed.touched] + [model.geom(mounted.gel).id for mounted in composed.sensors]
+        mass_centre = model.body_ipos[np.concatenate([bodies, pads])]
+        self.contact = GelContact(
+            gels,
+            Bodies([b.parts for b in composed.touched], bodies, pads, mass_centre, model.geom_pos[cases], model.geom_size[cases]),
+            GelPairs(gels, pads, count, device=device).pairs,
+            {
+                name: np.repeat(getattr(world.models, given)[:1], count, axis=0)
+                for name, given in (
+                    ("inverse_weight", "inverse_weight"),
+                    ("gel_stiffness", "gel_stiffness"),
+                    ("gel_friction", "gel_friction"),
+                    ("body_friction", "friction_on_gel"),
+                )
+            },
+            num_envs=count,
+            timestep=composed.timestep,
+            case_travel=0.8 * HARD_MARGIN,
+            device=device,
+        )
+        self.engine = MujocoWarp(
+            model,
+            num_envs=count,
+            sites=np.array([model.site(mounted.site).id for mounted in composed.sensors]),
+            bodies=np.concatenate([pads, bodies]),
+            geoms=np.array(geoms),
+            hard=is_hard(model),
+            contacts=args.contacts,
+            rows=args.rows,
+            device=device,
+        )
+        rng, qpos = np.random.default_rng(args.seed), np.repeat(composed.start[None], count, axis=0)
+        first = composed.bodies["cube"].qpos
+        turn = 0.5 * rng.uniform(-0.2, 0.2, count)
+        qpos[:, first : first + 2] += rng.uniform(-4e-3, 4e-3, (count, 2))
+        qpos[:, first + 3], qpos[:, first + 6] = np.cos(turn), np.sin(turn)
+        self.engine.set_states(qpos)
+        self.substeps = args.substeps
+        array = partial(wp.array, device=device)
+        n = len(world.arm)
+        known = {name: one for name, one in world.arm.numbers().items() if name in ("time", "joints", "speed", "bias", "mass")}
+        self.reader = self.engine.reader(known)
+        self.springs: Any = Springs()
+        for name in known:
+            setattr(self.springs, name, self.reader.arrays[name])
+        for name in ("target", "target_speed", "torque"):
+            setattr(self.springs, name, wp.zeros((count, n), dtype=wp.float64, device=device))
+        self.springs.start = wp.zeros(count, dtype=wp.float64, device=device)
+        self.springs.stiffness, self.springs.damping = FREQUENCY**2, 2.0 * FREQUENCY
+        self.motors = array(world.arm.motors.astype(np.int32), dtype=wp.int32)
+        self.joints, self.speeds = array(joints, dtype=wp.float64), array(speeds, dtype=wp.float64)
+        self.active = array(np.ones(count, bool), dtype=wp.bool)
+        self.counts, self.counter = wp.zeros(1, dtype=wp.int32, device=device), wp.zeros(1, dtype=wp.int32, device=device)
+
+    def control_step(self) -> None:
+        """One control step of all worlds."""
+        engine, contact, device = self.engine, self.contact, self.engine.device
+        count = engine.num_envs
+        self.reader.read()
+        tables = [self.joints, self.speeds, PRESS, self.counter, self.springs.time]
+        wp.launch(next_targets, dim=self.springs.target.shape, inputs=[*tables, self.springs], device=device)
+        for _ in range(self.substeps):
+            engine.begin_step()
+            self.reader.read()
+            wp.launch(joint_springs, dim=self.springs.torque.shape, inputs=[self.springs], device=device)
+            engine.write_controls(self.motors, self.springs.torque)
+            engine.free_acceleration()
+            engine.choose(self.active, contact.steps)
+            engine.read_frames(contact.frames)
+            contact.begin(whole=True)
+            engine.put_contacts(contact.slots, contact.steps)
+            engine.end_step(contact.steps)
+            engine.read_rows(contact.steps, contact.force, contact.velocity)
+            contact.end()
+        pressed = [contact.wrenches, LEAST_FORCE, self.counts]
+        wp.launch(count_pressed, dim=count, inputs=pressed, device=device)
+        wp.launch(count_step, dim=1, inputs=[self.counter], device=device)
+
+
+if __name__ == "__main__":
+    run(main, Args, __doc__)
