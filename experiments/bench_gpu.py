@@ -22,7 +22,6 @@ from experiments.running import recorded, run
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io import CommonOptions, Metric
-from raytac.physics.rigid.gel_contact import Bodies, GelContact
 from raytac.report import machine
 from raytac.robots.arm_kernels import Springs, joint_springs
 from raytac.robots.ik import PoseServo
@@ -30,8 +29,9 @@ from raytac.robots.impedance import JointImpedance
 from raytac.robots.panda import MAX_VELOCITY
 from raytac.specs import load_task
 from raytac.world.engine.mjwarp import MujocoWarp
+from raytac.world.environment_models import EnvironmentModels
 from raytac.world.gel_pairs import GelPairs
-from raytac.world.hard_contacts import HARD_MARGIN, is_hard
+from raytac.world.pad_contact import PadIndices, gel_contact
 from raytac.world.world import TactileWorld
 
 PRESS, CIRCLE = 20, 150
@@ -195,41 +195,11 @@ class Worlds:
     def __init__(self, world: TactileWorld, args: Args, device: str, joints: np.ndarray, speeds: np.ndarray) -> None:
         composed, model, count = world.composed, world.model, args.worlds
         assert world.arm is not None and world.arm.motors is not None
-        gels = tuple(spec.gelpad for spec in composed.sensor_specs)
-        bodies = np.array([body.index for body in composed.touched])
-        pads = np.array([model.body(mounted.body).id for mounted in composed.sensors])
-        cases = [model.geom(mounted.case).id for mounted in composed.sensors]
-        geoms = [body.geoms[0] for body in composed.touched] + [model.geom(mounted.gel).id for mounted in composed.sensors]
-        mass_centre = model.body_ipos[np.concatenate([bodies, pads])]
-        self.contact = GelContact(
-            gels,
-            Bodies([b.parts for b in composed.touched], bodies, pads, mass_centre, model.geom_pos[cases], model.geom_size[cases]),
-            GelPairs(gels, pads, count, device=device).pairs,
-            {
-                name: np.repeat(getattr(world.models, given)[:1], count, axis=0)
-                for name, given in (
-                    ("inverse_weight", "inverse_weight"),
-                    ("gel_stiffness", "gel_stiffness"),
-                    ("gel_friction", "gel_friction"),
-                    ("body_friction", "friction_on_gel"),
-                )
-            },
-            num_envs=count,
-            timestep=composed.timestep,
-            case_travel=0.8 * HARD_MARGIN,
-            device=device,
-        )
-        self.engine = MujocoWarp(
-            model,
-            num_envs=count,
-            sites=np.array([model.site(mounted.site).id for mounted in composed.sensors]),
-            bodies=np.concatenate([pads, bodies]),
-            geoms=np.array(geoms),
-            hard=is_hard(model),
-            contacts=args.contacts,
-            rows=args.rows,
-            device=device,
-        )
+        pads = PadIndices.of(composed)
+        pairs = GelPairs([spec.gelpad for spec in composed.sensor_specs], pads.carriers, count, device=device).pairs
+        models = EnvironmentModels(composed, count)
+        self.contact = gel_contact(composed, models, pairs, num_envs=count, device=device)
+        self.engine = MujocoWarp(model, pads, num_envs=count, contacts=args.contacts, rows=args.rows, device=device)
         rng, qpos = np.random.default_rng(args.seed), np.repeat(composed.start[None], count, axis=0)
         first = composed.bodies["cube"].qpos
         turn = 0.5 * rng.uniform(-0.2, 0.2, count)
@@ -253,6 +223,12 @@ class Worlds:
         self.active = array(np.ones(count, bool), dtype=wp.bool)
         self.counts, self.counter = wp.zeros(1, dtype=wp.int32, device=device), wp.zeros(1, dtype=wp.int32, device=device)
 
+    def drive(self) -> None:
+        """Torques of the springs in the joints."""
+        self.reader.read()
+        wp.launch(joint_springs, dim=self.springs.torque.shape, inputs=[self.springs], device=self.engine.device)
+        self.engine.write_controls(self.motors, self.springs.torque)
+
     def control_step(self) -> None:
         """One control step of all worlds."""
         engine, contact, device = self.engine, self.contact, self.engine.device
@@ -261,18 +237,7 @@ class Worlds:
         tables = [self.joints, self.speeds, PRESS, self.counter, self.springs.time]
         wp.launch(next_targets, dim=self.springs.target.shape, inputs=[*tables, self.springs], device=device)
         for _ in range(self.substeps):
-            engine.begin_step()
-            self.reader.read()
-            wp.launch(joint_springs, dim=self.springs.torque.shape, inputs=[self.springs], device=device)
-            engine.write_controls(self.motors, self.springs.torque)
-            engine.free_acceleration()
-            engine.choose(self.active, contact.steps)
-            engine.read_frames(contact.frames)
-            contact.begin(whole=True)
-            engine.put_contacts(contact.slots, contact.steps)
-            engine.end_step(contact.steps)
-            engine.read_rows(contact.steps, contact.force, contact.velocity)
-            contact.end()
+            engine.step(contact, self.active, self.drive)
         pressed = [contact.wrenches, LEAST_FORCE, self.counts]
         wp.launch(count_pressed, dim=count, inputs=pressed, device=device)
         wp.launch(count_step, dim=1, inputs=[self.counter], device=device)

@@ -16,12 +16,14 @@ import numpy as np
 import warp as wp
 
 from raytac.errors import BackendError, InputError
+from raytac.physics.rigid.gel_contact import GelContact
 from raytac.physics.rigid.motion_kernels import Frames
 from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
 from raytac.robots.states import Numbers
 from raytac.warp_runtime import start_warp
 from raytac.world.engine import mjwarp_kernels as kernels
 from raytac.world.implicit_damping import ImplicitDamping
+from raytac.world.pad_contact import PadIndices
 
 _SLIDES = 2
 """Solves for the lift of a slide that begins or ends, before that of the step."""
@@ -37,8 +39,6 @@ _VARIED = (
 class MujocoWarp:
     """States of B environments of one model, and the steps between which pads act.
 
-    A step is ``begin_step``, controls, ``free_acceleration``, ``read_frames``, ``put_contacts``, ``end_step``, ``read_rows``.
-
     Attributes:
         num_envs: B.
         device: of all arrays.
@@ -50,12 +50,9 @@ class MujocoWarp:
     def __init__(
         self,
         model: mujoco.MjModel,
+        pads: PadIndices,
         *,
         num_envs: int,
-        sites: np.ndarray,
-        bodies: np.ndarray,
-        geoms: np.ndarray,
-        hard: np.ndarray,
         timestep: float | None = None,
         contacts: int | None = None,
         rows: int | None = None,
@@ -65,11 +62,8 @@ class MujocoWarp:
 
         Args:
             model: of all environments; ``set_models`` gives them their own.
+            pads: what the model calls pads and what they touch.
             num_envs: B.
-            sites: at the pads' frames, (pads,).
-            bodies: that carry the pads, then those that they touch.
-            geoms: of the bodies that pads touch, then of the gels.
-            hard: geoms with the law of ``hard_contacts``, (ngeom,), bool.
             timestep: of all steps [s]; None is the model's.
             contacts, rows: memory for contacts and constraint rows, an environment each; None is a guess. All environments share the
                 memory for contacts. If it is too small, ``check_overflow`` raises an error.
@@ -86,8 +80,8 @@ class MujocoWarp:
         if timestep is not None:
             model.opt.timestep = timestep
         self.timestep = float(model.opt.timestep)
-        pads, touched = len(sites), len(geoms)
-        self._contacts = 24 + 2 * pads * touched + 4 * touched if contacts is None else contacts
+        slots = len(pads.sites), len(pads.geoms)
+        self._contacts = 24 + 2 * slots[0] * slots[1] + 4 * slots[1] if contacts is None else contacts
         self._rows = 4 * self._contacts if rows is None else rows
         self._damped = ImplicitDamping(model).matters
         with wp.ScopedDevice(self.device):
@@ -99,7 +93,7 @@ class MujocoWarp:
             self.data: Any = mjw.make_data(model, nworld=num_envs, nconmax=self._contacts, njmax=self._rows)
             self._use_gel_contacts()
             self._worlds = _worlds(self.model, self.data)
-            shape = num_envs, pads, touched
+            shape = num_envs, *slots
             self._own: Any = kernels.Own()
             self._own.first, self._own.sliding = wp.zeros(1, dtype=wp.int32), wp.zeros(num_envs, dtype=wp.int32)
             self._own.contact, self._own.scale = wp.full(shape, -1, dtype=wp.int32), wp.zeros(shape, dtype=wp.float64)
@@ -109,10 +103,11 @@ class MujocoWarp:
             self._saved.warmstart = wp.clone(self.data.qacc_warmstart)
             self._mass, self._damped_mass = wp.empty_like(self.data.M), wp.empty_like(self.data.M)
             self.peaks = wp.zeros(3, dtype=wp.int32)
+            bodies = np.concatenate([pads.carriers, pads.bodies])
             last = np.array([_last_dof(model, body) for body in bodies.tolist()])
-            self._sites, self._bodies, self._last = (_array(values) for values in (sites, bodies, last))
-            self._gels, self._others, self._hard = _array(geoms[touched - pads :]), _array(geoms), _array(hard)
-        self._mujoco_model = model
+            self._sites, self._bodies, self._last = (_array(values) for values in (pads.sites, bodies, last))
+            self._others, self._hard = _array(pads.geoms), _array(pads.hard)
+            self._gels = _array(pads.geoms[len(pads.bodies) :])
 
     def _use_gel_contacts(self) -> None:
         """Room for contacts of ``ROWS`` rows, which the model's own geoms may not have."""
@@ -187,6 +182,19 @@ class MujocoWarp:
     def read_rows(self, steps: Steps, force: wp.array, velocity: wp.array) -> None:
         """Forces of the gels' rows and their velocities at the end of the step."""
         self._launch(kernels.read_rows, self._own.contact.shape, [self._worlds, self._own, steps, force, velocity])
+
+    def step(self, contact: GelContact, active: wp.array, drive: Callable[[], None] = lambda: None) -> None:
+        """One step of the environments that are ``active`` (B,), bool, with the gels' contact; ``drive`` writes controls."""
+        self.begin_step()
+        drive()
+        self.free_acceleration()
+        self.choose(active, contact.steps)
+        self.read_frames(contact.frames)
+        contact.begin(whole=True)
+        self.put_contacts(contact.slots, contact.steps)
+        self.end_step(contact.steps)
+        self.read_rows(contact.steps, contact.force, contact.velocity)
+        contact.end()
 
     def update_poses(self) -> None:
         """Poses at the present positions."""
