@@ -8,11 +8,16 @@ is a control step of 20 ms with ``--substeps`` steps of MuJoCo; on CUDA all of i
 that are timed a world's pad carried at least 0.1 N.
 """
 
+# pyright: reportInvalidTypeForm=false, reportGeneralTypeIssues=false, reportAssignmentType=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,13 +31,17 @@ from raytac.report import machine
 from raytac.robots.arm_kernels import Springs, joint_springs
 from raytac.robots.ik import PoseServo
 from raytac.robots.impedance import JointImpedance
+from raytac.robots.joint_springs import JointSprings
 from raytac.robots.panda import MAX_VELOCITY
 from raytac.specs import load_task
+from raytac.world.compose import compose
 from raytac.world.engine.mjwarp import MujocoWarp
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.gel_pairs import GelPairs
 from raytac.world.pad_contact import PadIndices, gel_contact
 from raytac.world.world import TactileWorld
+from raytac.world.world_model import WorldModel
+from raytac.world.world_state import BatchController
 
 PRESS, CIRCLE = 20, 150
 """Control steps in which the pad is pressed on, and of one turn."""
@@ -40,6 +49,7 @@ DEPTH, RADIUS = 2.9e-3, 0.015
 """Path down from 2 mm above the cube, and radius of the circle [m]."""
 FREQUENCY = 30.0
 """Of the springs in the joints [rad/s]."""
+_OWNED = "metrics.json", "targets.npz"
 LEAST_FORCE = 0.1
 """Of a pad that is pressed [N]."""
 
@@ -58,6 +68,8 @@ class Args(CommonOptions):
     """Memory for contacts of each environment; None is a guess."""
     rows: int | None = None
     """Memory for constraint rows of each environment; None is a guess."""
+    targets: Path | None = None
+    """``targets.npz`` of another run, so that C MuJoCo need not run before."""
 
 
 @wp.kernel
@@ -99,9 +111,9 @@ def main(args: Args) -> dict[str, Metric]:
         if getattr(args, name) < 1:
             raise InputError(name, value=getattr(args, name), rule="must be 1 or more")
     device = resolve_device(args.device, ray_tracing=False)
-    with recorded(args, "bench_gpu", device=device, owned=("metrics.json",), packages=("mujoco-warp", "warp-lang")) as (_, metrics):
+    with recorded(args, "bench_gpu", device=device, owned=_OWNED, packages=("mujoco-warp", "warp-lang")) as (folder, metrics):
         metrics |= {"worlds": args.worlds, "steps": args.steps, "substeps": args.substeps, **machine()}
-        found = timed(args, device)
+        found = timed(args, device, folder)
         where = "gpu" if device == "cuda" else "cpu"
         metrics |= {f"{where}.push.physics.{key}": value for key, value in found.items()}
         for key, value in found.items():
@@ -109,15 +121,19 @@ def main(args: Args) -> dict[str, Metric]:
     return metrics
 
 
-def timed(args: Args, device: str) -> dict[str, Metric]:
-    """Keys of the benchmark."""
+def timed(args: Args, device: str, folder: Path) -> dict[str, Metric]:
+    """Keys of the benchmark; ``folder`` gets the targets."""
     scene = load_task("push_cube")
     scene = replace(scene, timestep=scene.control_timestep / args.substeps)
-    world = TactileWorld(scene, outputs=())
-    joints, speeds = record(world)
+    if args.targets is None:
+        joints, speeds = record(TactileWorld(scene, outputs=()))
+    else:
+        stored = np.load(args.targets)
+        joints, speeds = stored["joints"], stored["speeds"]
+    np.savez(folder / "targets.npz", joints=joints, speeds=speeds)
     begin, where = time.perf_counter(), wp.get_device(device)
     free = where.free_memory if where.is_cuda else 0
-    bench = Worlds(world, args, device, joints, speeds)
+    bench = Worlds(compose(scene, "rigid"), args, device, joints, speeds)
     step = bench.engine.capture(bench.control_step)
     for _ in range(PRESS + CIRCLE // 5):
         step()
@@ -155,7 +171,7 @@ def record(world: TactileWorld) -> tuple[np.ndarray, np.ndarray]:
     servo = PoseServo(arm, max_velocity=np.array(MAX_VELOCITY), posture=world.composed.start[arm.qpos])
     springs = JointImpedance(arm, frequency=FREQUENCY).springs(world.data)
     start = arm.world_from_site(world.data[0])
-    follow = _follow(springs)
+    follow = _Follow(springs)
     joints, speeds = [], []
     for k in range(PRESS + CIRCLE):
         before, after = (pose_at(start, m) for m in (k, k + 1))
@@ -170,14 +186,14 @@ def record(world: TactileWorld) -> tuple[np.ndarray, np.ndarray]:
     return np.array(joints), np.array(speeds)
 
 
-def _follow(springs: Any) -> Any:
-    from raytac.world.world_state import BatchController
+class _Follow(BatchController):
+    """Springs in the joints of all environments."""
 
-    class Follow(BatchController):
-        def drive(self, datas: Any, envs: Any) -> None:
-            springs.drive(envs)
+    def __init__(self, springs: JointSprings) -> None:
+        self._springs = springs
 
-    return Follow()
+    def drive(self, datas: Sequence[Any], envs: Sequence[int] | np.ndarray) -> None:
+        self._springs.drive(envs)
 
 
 def pose_at(start: np.ndarray, step: int) -> np.ndarray:
@@ -192,14 +208,14 @@ def pose_at(start: np.ndarray, step: int) -> np.ndarray:
 class Worlds:
     """Worlds on MuJoCo Warp, and what happens in a control step."""
 
-    def __init__(self, world: TactileWorld, args: Args, device: str, joints: np.ndarray, speeds: np.ndarray) -> None:
-        composed, model, count = world.composed, world.model, args.worlds
-        assert world.arm is not None and world.arm.motors is not None
+    def __init__(self, composed: WorldModel, args: Args, device: str, joints: np.ndarray, speeds: np.ndarray) -> None:
+        arm, count = composed.arm, args.worlds
+        assert arm is not None and arm.motors is not None
         pads = PadIndices.of(composed)
         pairs = GelPairs([spec.gelpad for spec in composed.sensor_specs], pads.carriers, count, device=device).pairs
         models = EnvironmentModels(composed, count)
         self.contact = gel_contact(composed, models, pairs, num_envs=count, device=device)
-        self.engine = MujocoWarp(model, pads, num_envs=count, contacts=args.contacts, rows=args.rows, device=device)
+        self.engine = MujocoWarp(composed.model, pads, num_envs=count, contacts=args.contacts, rows=args.rows, device=device)
         rng, qpos = np.random.default_rng(args.seed), np.repeat(composed.start[None], count, axis=0)
         first = composed.bodies["cube"].qpos
         turn = 0.5 * rng.uniform(-0.2, 0.2, count)
@@ -208,8 +224,8 @@ class Worlds:
         self.engine.set_states(qpos)
         self.substeps = args.substeps
         array = partial(wp.array, device=device)
-        n = len(world.arm)
-        known = {name: one for name, one in world.arm.numbers().items() if name in ("time", "joints", "speed", "bias", "mass")}
+        n = len(arm)
+        known = {name: one for name, one in arm.numbers().items() if name in ("time", "joints", "speed", "bias", "mass")}
         self.reader = self.engine.reader(known)
         self.springs: Any = Springs()
         for name in known:
@@ -218,7 +234,7 @@ class Worlds:
             setattr(self.springs, name, wp.zeros((count, n), dtype=wp.float64, device=device))
         self.springs.start = wp.zeros(count, dtype=wp.float64, device=device)
         self.springs.stiffness, self.springs.damping = FREQUENCY**2, 2.0 * FREQUENCY
-        self.motors = array(world.arm.motors.astype(np.int32), dtype=wp.int32)
+        self.motors = array(arm.motors.astype(np.int32), dtype=wp.int32)
         self.joints, self.speeds = array(joints, dtype=wp.float64), array(speeds, dtype=wp.float64)
         self.active = array(np.ones(count, bool), dtype=wp.bool)
         self.counts, self.counter = wp.zeros(1, dtype=wp.int32, device=device), wp.zeros(1, dtype=wp.int32, device=device)

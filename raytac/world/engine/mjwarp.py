@@ -6,6 +6,7 @@ length, and none can be left out: one that is not active, or breaks down, is put
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from functools import partial
@@ -17,8 +18,7 @@ import warp as wp
 
 from raytac.errors import BackendError, InputError
 from raytac.physics.rigid.gel_contact import GelContact
-from raytac.physics.rigid.motion_kernels import Frames
-from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
+from raytac.physics.rigid.world_kernels import ROWS
 from raytac.robots.states import Numbers
 from raytac.warp_runtime import start_warp
 from raytac.world.engine import mjwarp_kernels as kernels
@@ -89,7 +89,9 @@ class MujocoWarp:
             try:
                 self.model: Any = mjw.put_model(model, batch_sizes=sizes)
             except (NotImplementedError, ValueError) as error:
-                raise InputError("model", value=model, rule=f"is refused by MuJoCo Warp: {' '.join(str(error).split())}") from error
+                raise InputError(
+                    "model", value=model, rule=f"is refused by MuJoCo Warp: {' '.join(str(error).split())}"
+                ) from error
             self.data: Any = mjw.make_data(model, nworld=num_envs, nconmax=self._contacts, njmax=self._rows)
             self._use_gel_contacts()
             self._worlds = _worlds(self.model, self.data)
@@ -137,16 +139,16 @@ class MujocoWarp:
             self._mjw.fwd_actuation(self.model, self.data)
             self._mjw.fwd_acceleration(self.model, self.data)
 
-    def choose(self, active: wp.array, steps: Steps) -> None:
+    def choose(self, active: wp.array, steps: Any) -> None:
         """Name the environments of this step, those that are ``active`` (B,), bool."""
         self._launch(kernels.choose_worlds, self.num_envs, [active, steps])
 
-    def read_frames(self, frames: Frames) -> None:
+    def read_frames(self, frames: Any) -> None:
         """Frames of pads and bodies, after ``free_acceleration``."""
         shape = self.num_envs, len(self._bodies)
         self._launch(kernels.read_frames, shape, [self._worlds, self._sites, self._bodies, self._last, frames])
 
-    def put_contacts(self, slots: Slots, steps: Steps) -> None:
+    def put_contacts(self, slots: Any, steps: Any) -> None:
         """Put the contacts that ``GelContact.begin`` chose among MuJoCo's own, make all constraints, and solve for the lifts of slides."""
         worlds, own, mjw = self._worlds, self._own, self._mjw
         with wp.ScopedDevice(self.device):
@@ -163,14 +165,14 @@ class MujocoWarp:
                 self._launch(kernels.begin_correction, self.num_envs, [worlds, steps, own])
                 self._launch(kernels.correct_lifts, own.contact.shape, [worlds, own, steps, slots])
 
-    def _add_damping(self, steps: Steps) -> None:
+    def _add_damping(self, steps: Any) -> None:
         model, data = self.model, self.data
         self._mjw.deriv_smooth_vel(model, data, self._damped_mass)
         self._launch(kernels.add_damping, self._mass.shape, [self._worlds, steps, self._damped_mass, self._mass])
         self._mjw.factor_m(model, data)
         self._mjw.solve_m(model, data, data.qacc_smooth, data.qfrc_smooth)
 
-    def end_step(self, steps: Steps) -> None:
+    def end_step(self, steps: Any) -> None:
         """Solve and integrate."""
         with wp.ScopedDevice(self.device):
             self._mjw.solve(self.model, self.data)
@@ -179,7 +181,7 @@ class MujocoWarp:
             self._mjw.implicit(self.model, self.data)
             self._launch(kernels.end_states, self.num_envs, [self._worlds, self._saved, steps, self.peaks])
 
-    def read_rows(self, steps: Steps, force: wp.array, velocity: wp.array) -> None:
+    def read_rows(self, steps: Any, force: wp.array, velocity: wp.array) -> None:
         """Forces of the gels' rows and their velocities at the end of the step."""
         self._launch(kernels.read_rows, self._own.contact.shape, [self._worlds, self._own, steps, force, velocity])
 
@@ -245,9 +247,13 @@ class MujocoWarp:
         most = max(contacts, pairs)
         if most > self.data.naconmax:
             least = -(-most // self.num_envs)
-            raise InputError("contacts", value=self._contacts, rule=f"must be {least} or more: contacts of an environment were lost")
+            raise InputError(
+                "contacts", value=self._contacts, rule=f"must be {least} or more: contacts of an environment were lost"
+            )
         if rows > self.data.njmax:
-            raise InputError("rows", value=self._rows, rule=f"must be {rows} or more: constraint rows of an environment were lost")
+            raise InputError(
+                "rows", value=self._rows, rule=f"must be {rows} or more: constraint rows of an environment were lost"
+            )
         names = ", ".join(str(one.name) for one in lost)
         raise InputError("contacts", value=self._contacts, rule=f"must be more: MuJoCo Warp has lost contacts ({names})")
 
@@ -277,9 +283,9 @@ class NumberReader:
             shapes[key] = size, (num_envs, *one.shape)
             size += num_envs * width
         self._flat = wp.zeros(size, dtype=wp.float64, device=device)
+        first = int(self._flat.ptr or 0)
         self.arrays: dict[str, wp.array] = {
-            key: wp.array(ptr=self._flat.ptr + 8 * at, shape=shape, dtype=wp.float64, device=device)
-            for key, (at, shape) in shapes.items()
+            key: wp.array(ptr=first + 8 * at, shape=shape, dtype=wp.float64, device=device) for key, (at, shape) in shapes.items()
         }
         entries: Any = kernels.Entries()
         entries.arrays = wp.array([array.ptr for array in self._sources], dtype=wp.uint64, device=device)
@@ -301,10 +307,9 @@ _LOST = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "HFIELD")
 
 def _mujoco_warp() -> Any:
     try:
-        import mujoco_warp
+        return importlib.import_module("mujoco_warp")
     except ImportError as error:
         raise BackendError("worlds on a GPU need MuJoCo Warp: pip install 'raytac[gpu]'") from error
-    return mujoco_warp
 
 
 def _checked(model: mujoco.MjModel) -> mujoco.MjModel:

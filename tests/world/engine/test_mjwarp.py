@@ -157,7 +157,7 @@ def test_a_world_that_breaks_down_or_is_left_out_stands_still_and_leaves_the_oth
 
 
 @pytest.mark.parametrize(("options", "name"), [({"contacts": 0, "rows": 64}, "contacts"), ({"rows": 5}, "rows")])
-def test_memory_that_is_too_small_is_an_error_that_names_the_number(options: dict[str, int], name: str) -> None:
+def test_memory_that_is_too_small_is_an_error_that_names_the_number(options: dict[str, Any], name: str) -> None:
     warped = Warped.balls(**options)
     warped.engine.check_overflow()
     warped.step()
