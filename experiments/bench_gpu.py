@@ -33,7 +33,7 @@ from raytac.robots.ik import PoseServo
 from raytac.robots.impedance import JointImpedance
 from raytac.robots.joint_springs import JointSprings
 from raytac.robots.panda import MAX_VELOCITY
-from raytac.specs import load_task
+from raytac.specs import TaskScene, load_task
 from raytac.world.compose import compose
 from raytac.world.engine.mjwarp import MujocoWarp
 from raytac.world.environment_models import EnvironmentModels
@@ -123,8 +123,7 @@ def main(args: Args) -> dict[str, Metric]:
 
 def timed(args: Args, device: str, folder: Path) -> dict[str, Metric]:
     """Keys of the benchmark; ``folder`` gets the targets."""
-    scene = load_task("push_cube")
-    scene = replace(scene, timestep=scene.control_timestep / args.substeps)
+    scene = scene_of(args)
     if args.targets is None:
         joints, speeds = record(TactileWorld(scene, outputs=()))
     else:
@@ -164,6 +163,12 @@ def timed(args: Args, device: str, folder: Path) -> dict[str, Metric]:
     }
 
 
+def scene_of(args: Args) -> TaskScene:
+    """The scene with steps of MuJoCo as long as is asked."""
+    scene = load_task("push_cube")
+    return replace(scene, timestep=scene.control_timestep / args.substeps)
+
+
 def record(world: TactileWorld) -> tuple[np.ndarray, np.ndarray]:
     """Joint targets (steps, n) and their speeds with which the pad is pressed on and goes round."""
     arm, dt = world.arm, world.control_timestep
@@ -171,7 +176,7 @@ def record(world: TactileWorld) -> tuple[np.ndarray, np.ndarray]:
     servo = PoseServo(arm, max_velocity=np.array(MAX_VELOCITY), posture=world.composed.start[arm.qpos])
     springs = JointImpedance(arm, frequency=FREQUENCY).springs(world.data)
     start = arm.world_from_site(world.data[0])
-    follow = _Follow(springs)
+    follow = Follow(springs)
     joints, speeds = [], []
     for k in range(PRESS + CIRCLE):
         before, after = (pose_at(start, m) for m in (k, k + 1))
@@ -186,7 +191,7 @@ def record(world: TactileWorld) -> tuple[np.ndarray, np.ndarray]:
     return np.array(joints), np.array(speeds)
 
 
-class _Follow(BatchController):
+class Follow(BatchController):
     """Springs in the joints of all environments."""
 
     def __init__(self, springs: JointSprings) -> None:
