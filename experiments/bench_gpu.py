@@ -14,7 +14,7 @@ that are timed a world's pad carried at least 0.1 N.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -146,6 +146,8 @@ def timed(args: Args, device: str, folder: Path) -> dict[str, Metric]:
     wall = time.perf_counter() - begin
     bench.engine.check_overflow()
     pressed = int(bench.counts.numpy()[0])
+    memory = (free - where.free_memory) / 1e9 if where.is_cuda else 0.0
+    split = bench.split(args.steps // 10 + 1)
     lost = int((bench.contact.steps.lost.numpy() != 0).sum())
     finite = bool(np.isfinite(bench.engine.data.qpos.numpy()).all())
     peaks = bench.engine.peaks.numpy().tolist()
@@ -158,8 +160,9 @@ def timed(args: Args, device: str, folder: Path) -> dict[str, Metric]:
         "contacts_per_world": peaks[0] / args.worlds,
         "pairs_per_world": peaks[1] / args.worlds,
         "most_rows": peaks[2],
-        "memory_gb": (free - where.free_memory) / 1e9 if where.is_cuda else 0.0,
+        "memory_gb": memory,
         "prepared_s": prepared,
+        **{f"split.{name}_ms": value for name, value in split.items()},
     }
 
 
@@ -262,6 +265,36 @@ class Worlds:
         pressed = [contact.wrenches, LEAST_FORCE, self.counts]
         wp.launch(count_pressed, dim=count, inputs=pressed, device=device)
         wp.launch(count_step, dim=1, inputs=[self.counter], device=device)
+
+    def split(self, steps: int) -> dict[str, float]:
+        """Milliseconds of a control step's parts, each waited for, so that they add up to more than a step."""
+        engine, contact = self.engine, self.contact
+
+        def find() -> None:
+            engine.choose(self.active, contact.steps)
+            engine.read_frames(contact.frames)
+            contact.begin(whole=True)
+
+        parts: dict[str, Callable[[], None]] = {
+            "begin_step": engine.begin_step,
+            "drive": self.drive,
+            "free_acceleration": engine.free_acceleration,
+            "find_contacts": find,
+            "put_contacts": partial(engine.put_contacts, contact.slots, contact.steps),
+            "end_step": partial(engine.end_step, contact.steps),
+            "read_rows": partial(engine.read_rows, contact.steps, contact.force, contact.velocity),
+            "shear": contact.end,
+        }
+        recorded_parts = {name: engine.capture(part) for name, part in parts.items()}
+        spent = dict.fromkeys(parts, 0.0)
+        for _ in range(steps * self.substeps):
+            for name, part in recorded_parts.items():
+                wp.synchronize_device(engine.device)
+                begin = time.perf_counter()
+                part()
+                wp.synchronize_device(engine.device)
+                spent[name] += time.perf_counter() - begin
+        return {name: 1e3 * value / steps for name, value in spent.items()}
 
 
 if __name__ == "__main__":

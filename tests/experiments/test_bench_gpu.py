@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 pytest.importorskip("mujoco_warp")
-from experiments.bench_gpu import FREQUENCY, PRESS, Args, Follow, Worlds, record, scene_of  # noqa: E402
-from raytac.robots.impedance import JointImpedance  # noqa: E402
-from raytac.world import TactileWorld  # noqa: E402
+from experiments.bench_gpu import FREQUENCY, PRESS, Args, Follow, Worlds, record, scene_of
+from raytac.robots.impedance import JointImpedance
+from raytac.world import TactileWorld
 
 STEPS = 50
 
