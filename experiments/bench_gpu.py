@@ -229,7 +229,9 @@ class Worlds:
         turn = 0.5 * rng.uniform(-0.2, 0.2, count)
         qpos[:, first : first + 2] += rng.uniform(-4e-3, 4e-3, (count, 2))
         qpos[:, first + 3], qpos[:, first + 6] = np.cos(turn), np.sin(turn)
-        self.engine.set_states(qpos)
+        self.active = wp.array(np.ones(count, bool), dtype=wp.bool, device=device)
+        start = [qpos, np.repeat(composed.ctrl[None], count, axis=0)]
+        self.engine.reset(self.active, *(wp.array(values, dtype=wp.float32, device=device) for values in start))
         self.substeps = args.substeps
         array = partial(wp.array, device=device)
         n = len(arm)
@@ -244,7 +246,6 @@ class Worlds:
         self.springs.stiffness, self.springs.damping = FREQUENCY**2, 2.0 * FREQUENCY
         self.motors = array(arm.motors.astype(np.int32), dtype=wp.int32)
         self.joints, self.speeds = array(joints, dtype=wp.float64), array(speeds, dtype=wp.float64)
-        self.active = array(np.ones(count, bool), dtype=wp.bool)
         self.counts, self.counter = wp.zeros(1, dtype=wp.int32, device=device), wp.zeros(1, dtype=wp.int32, device=device)
 
     def drive(self) -> None:

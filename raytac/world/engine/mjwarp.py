@@ -44,7 +44,8 @@ class MujocoWarp:
         device: of all arrays.
         timestep: of all steps [s].
         model, data: MuJoCo Warp's.
-        peaks: most contacts of all environments at once, most pairs of its collision, and most rows of one environment, (3,).
+        peaks: most contacts of all environments at once, most pairs of MuJoCo's collision, most rows of one environment, and flags of
+            overflow, (4,).
     """
 
     def __init__(
@@ -104,7 +105,7 @@ class MujocoWarp:
                 setattr(self._saved, name, wp.clone(getattr(self.data, name)))
             self._saved.warmstart = wp.clone(self.data.qacc_warmstart)
             self._mass, self._damped_mass = wp.empty_like(self.data.M), wp.empty_like(self.data.M)
-            self.peaks = wp.zeros(3, dtype=wp.int32)
+            self.peaks = wp.zeros(4, dtype=wp.int32)
             bodies = np.concatenate([pads.carriers, pads.bodies])
             last = np.array([_last_dof(model, body) for body in bodies.tolist()])
             self._sites, self._bodies, self._last = (_array(values) for values in (pads.sites, bodies, last))
@@ -229,21 +230,18 @@ class MujocoWarp:
                 array = getattr(self.model, name)
                 array.assign(values.astype(np.float32).reshape(array.numpy().shape))
 
-    def set_states(self, qpos: np.ndarray, qvel: np.ndarray | None = None) -> None:
-        """Put all environments to positions (B, nq) and velocities (B, nv), at the time 0."""
+    def reset(self, chosen: wp.array, qpos: wp.array, ctrl: wp.array) -> None:
+        """Put the environments that are ``chosen`` (B,), bool, to positions (B, nq) and controls (B, nu), at rest and at the time 0."""
         with wp.ScopedDevice(self.device):
-            self._mjw.reset_data(self.model, self.data)
-            self.data.qpos.assign(np.asarray(qpos, np.float32))
-            if qvel is not None:
-                self.data.qvel.assign(np.asarray(qvel, np.float32))
+            self._mjw.reset_data(self.model, self.data, reset=chosen)
+        self._launch(kernels.place_states, self.num_envs, [chosen, qpos, ctrl, self._worlds])
 
     def check_overflow(self) -> None:
         """Raise ``InputError`` if contacts or rows were lost since the states were made; it waits for the device."""
-        overflow = int(np.bitwise_or.reduce(self.data.overflow.numpy()))
+        contacts, pairs, rows, overflow = self.peaks.numpy().tolist()
         lost = [one for one in self._mjw.OverflowType if one & overflow and one.name in _LOST]
         if not lost:
             return
-        contacts, pairs, rows = self.peaks.numpy().tolist()
         most = max(contacts, pairs)
         if most > self.data.naconmax:
             least = -(-most // self.num_envs)
@@ -353,8 +351,8 @@ def _array(values: np.ndarray) -> wp.array:
 
 
 _DATA = (
-    "time", "qpos", "qvel", "act", "qacc", "qacc_smooth", "qacc_warmstart", "M", "xpos", "xmat", "site_xpos", "site_xmat", "subtree_com",
-    "cvel", "cdof", "nacon", "ncollision", "nefc",
+    "time", "qpos", "qvel", "act", "ctrl", "qacc", "qacc_smooth", "qacc_warmstart", "M", "xpos", "xmat", "site_xpos", "site_xmat",
+    "subtree_com", "cvel", "cdof", "nacon", "ncollision", "nefc", "overflow",
 )  # fmt: skip
 _CONTACT = (
     "dist", "pos", "frame", "includemargin", "friction", "solref", "solreffriction", "solimp", "dim", "geom", "flex",

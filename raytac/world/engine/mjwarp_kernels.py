@@ -53,6 +53,7 @@ class Worlds:
     qpos: wp.array2d(dtype=wp.float32)
     qvel: wp.array2d(dtype=wp.float32)
     act: wp.array2d(dtype=wp.float32)
+    ctrl: wp.array2d(dtype=wp.float32)
     qacc: wp.array2d(dtype=wp.float32)
     qacc_smooth: wp.array2d(dtype=wp.float32)
     qacc_warmstart: wp.array2d(dtype=wp.float32)
@@ -67,6 +68,7 @@ class Worlds:
     nacon: wp.array(dtype=wp.int32)
     ncollision: wp.array(dtype=wp.int32)
     nefc: wp.array(dtype=wp.int32)
+    overflow: wp.array(dtype=wp.int32)
     # Contacts.
     dist: wp.array(dtype=wp.float32)
     pos: wp.array(dtype=wp.vec3)
@@ -119,6 +121,19 @@ class Saved:
     qvel: wp.array2d(dtype=wp.float32)
     act: wp.array2d(dtype=wp.float32)
     warmstart: wp.array2d(dtype=wp.float32)
+
+
+@wp.kernel
+def place_states(
+    chosen: wp.array(dtype=wp.bool), qpos: wp.array2d(dtype=wp.float32), ctrl: wp.array2d(dtype=wp.float32), worlds: Worlds
+):
+    """Set positions (B, nq) and controls (B, nu) of the environments that are ``chosen``."""
+    i = wp.tid()
+    if chosen[i]:
+        for k in range(worlds.qpos.shape[1]):
+            worlds.qpos[i, k] = qpos[i, k]
+        for k in range(worlds.ctrl.shape[1]):
+            worlds.ctrl[i, k] = ctrl[i, k]
 
 
 @wp.func
@@ -380,14 +395,16 @@ def add_damping(worlds: Worlds, steps: Steps, damped: wp.array2d(dtype=wp.float3
 def end_states(worlds: Worlds, saved: Saved, steps: Steps, peaks: wp.array(dtype=wp.int32)):
     """Mark environments whose physics broke down, and put them and those left out back to where the step began.
 
-    A number is not finite then, or a joint is far too fast. ``peaks``: most contacts of all environments, most pairs of its collision, and
-    most rows of one environment.
+    A number is not finite then, or a joint is far too fast. ``peaks``: most contacts of all environments, most pairs of MuJoCo's collision,
+    most rows of one environment, and all of MuJoCo Warp's flags of overflow so far, which a reset clears there.
     """
     i = wp.tid()
     if i == 0:
         wp.atomic_max(peaks, 0, worlds.nacon[0])
         wp.atomic_max(peaks, 1, worlds.ncollision[0])
     wp.atomic_max(peaks, 2, worlds.nefc[i])
+    if worlds.overflow[i] != 0:
+        wp.atomic_or(peaks, 3, worlds.overflow[i])
     total = wp.float32(0.0)
     for k in range(worlds.qvel.shape[1]):
         if not wp.abs(worlds.qvel[i, k]) < _LARGEST_SPEED:

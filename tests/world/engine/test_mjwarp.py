@@ -53,14 +53,19 @@ class Warped:
         self.contact = gel_contact(composed, numbers, pairs, num_envs=count, device=device)
         self.engine = MujocoWarp(composed.model, pads, num_envs=count, device=device, **options)
         self.engine.set_models(models)
-        self.engine.set_states(np.repeat(composed.start[None], count, axis=0))
         self.active = wp.full(count, value=True, dtype=wp.bool, device=device)
+        start, ctrl = (np.repeat(values[None], count, axis=0) for values in (composed.start, composed.ctrl))
+        self._start = [wp.array(values, dtype=wp.float32, device=device) for values in (start, ctrl)]
+        self.reset(self.active)
         self.data, self.step = self.engine.data, partial(self.engine.step, self.contact, self.active)
 
     @classmethod
     def balls(cls, masses: Sequence[float] = MASSES, device: str = "cpu", **options: Any) -> Warped:
         composed = own_world_model(ball_on_pad(masses[0]), touches=TOUCHES)
         return cls([ball_on_pad(mass) for mass in masses], composed, device, **options)
+
+    def reset(self, chosen: wp.array) -> None:
+        self.engine.reset(chosen, *self._start)
 
     def apply(self, force: np.ndarray) -> None:
         """Forces and torques (B, 6) on the last body."""
@@ -156,11 +161,31 @@ def test_a_world_that_breaks_down_or_is_left_out_stands_still_and_leaves_the_oth
     assert broken.data.time.numpy()[1] < sound.data.time.numpy()[1]
 
 
+def test_a_reset_of_some_worlds_leaves_the_others_to_the_bit() -> None:
+    one, other, fresh = Warped.balls(), Warped.balls(), Warped.balls()
+    for step in range(50):
+        force = np.array([drag(step, mass) for mass in MASSES])
+        for warped in (one, other):
+            warped.apply(force)
+            warped.step()
+    one.reset(wp.array([False, True], dtype=wp.bool))
+    one.contact.clear(np.array([1]))
+    np.testing.assert_array_equal(one.state()[1], fresh.state()[1])
+    for step in range(30):
+        force = np.array([drag(50 + step, MASSES[0]), drag(step, MASSES[1])])
+        for warped, rows in ((one, (0, 1)), (other, (0, 0)), (fresh, (1, 1))):
+            warped.apply(force[list(rows)])
+            warped.step()
+    np.testing.assert_array_equal(one.state(), [other.state()[0], fresh.state()[1]])
+    np.testing.assert_array_equal(one.wrench(), [other.wrench()[0], fresh.wrench()[1]])
+
+
 @pytest.mark.parametrize(("options", "name"), [({"contacts": 0, "rows": 64}, "contacts"), ({"rows": 5}, "rows")])
 def test_memory_that_is_too_small_is_an_error_that_names_the_number(options: dict[str, Any], name: str) -> None:
     warped = Warped.balls(**options)
     warped.engine.check_overflow()
     warped.step()
+    warped.reset(warped.active)  # which does not hide it
     with pytest.raises(InputError, match="or more") as error:
         warped.engine.check_overflow()
     assert error.value.name == name
