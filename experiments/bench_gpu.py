@@ -64,6 +64,8 @@ class Args(CommonOptions):
     """Control steps that are timed, after those in which the pads are pressed on."""
     substeps: int = 2
     """Steps of MuJoCo in a control step."""
+    most: int = 1
+    """Steps into which each of these may be divided where something moves fast near a pad."""
     contacts: int | None = None
     """Memory for contacts of each environment; None is a guess."""
     rows: int | None = None
@@ -107,12 +109,12 @@ def count_step(counter: wp.array(dtype=wp.int32)):
 
 def main(args: Args) -> dict[str, Metric]:
     """Run it and write ``metrics.json``."""
-    for name in ("worlds", "steps", "substeps"):
+    for name in ("worlds", "steps", "substeps", "most"):
         if getattr(args, name) < 1:
             raise InputError(name, value=getattr(args, name), rule="must be 1 or more")
     device = resolve_device(args.device, ray_tracing=False)
     with recorded(args, "bench_gpu", device=device, owned=_OWNED, packages=("mujoco-warp", "warp-lang")) as (folder, metrics):
-        metrics |= {"worlds": args.worlds, "steps": args.steps, "substeps": args.substeps, **machine()}
+        metrics |= {"worlds": args.worlds, "steps": args.steps, "substeps": args.substeps, "most": args.most, **machine()}
         found = timed(args, device, folder)
         where = "gpu" if device == "cuda" else "cpu"
         metrics |= {f"{where}.push.physics.{key}": value for key, value in found.items()}
@@ -148,7 +150,7 @@ def timed(args: Args, device: str, folder: Path) -> dict[str, Metric]:
     pressed = int(bench.counts.numpy()[0])
     memory = (free - where.free_memory) / 1e9 if where.is_cuda else 0.0
     split = bench.split(args.steps // 10 + 1)
-    lost = int((bench.contact.steps.lost.numpy() != 0).sum())
+    lost = int((~bench.engine.active.numpy()).sum())
     finite = bool(np.isfinite(bench.engine.data.qpos.numpy()).all())
     peaks = bench.engine.peaks.numpy().tolist()
     return {
@@ -229,10 +231,9 @@ class Worlds:
         turn = 0.5 * rng.uniform(-0.2, 0.2, count)
         qpos[:, first : first + 2] += rng.uniform(-4e-3, 4e-3, (count, 2))
         qpos[:, first + 3], qpos[:, first + 6] = np.cos(turn), np.sin(turn)
-        self.active = wp.array(np.ones(count, bool), dtype=wp.bool, device=device)
         start = [qpos, np.repeat(composed.ctrl[None], count, axis=0)]
-        self.engine.reset(self.active, *(wp.array(values, dtype=wp.float32, device=device) for values in start))
-        self.substeps = args.substeps
+        self.engine.reset(self.engine.active, *(wp.array(values, dtype=wp.float32, device=device) for values in start))
+        self.substeps, self.most = args.substeps, args.most
         array = partial(wp.array, device=device)
         n = len(arm)
         known = {name: one for name, one in arm.numbers().items() if name in ("time", "joints", "speed", "bias", "mass")}
@@ -262,7 +263,7 @@ class Worlds:
         tables = [self.joints, self.speeds, PRESS, self.counter, self.springs.time]
         wp.launch(next_targets, dim=self.springs.target.shape, inputs=[*tables, self.springs], device=device)
         for _ in range(self.substeps):
-            engine.step(contact, self.active, self.drive)
+            engine.step(contact, self.drive, most=self.most)
         pressed = [contact.wrenches, LEAST_FORCE, self.counts]
         wp.launch(count_pressed, dim=count, inputs=pressed, device=device)
         wp.launch(count_step, dim=1, inputs=[self.counter], device=device)
@@ -272,7 +273,7 @@ class Worlds:
         engine, contact = self.engine, self.contact
 
         def find() -> None:
-            engine.choose(self.active, contact.steps)
+            engine.choose(contact.steps, contact.ticks, first=True)
             engine.read_frames(contact.frames)
             contact.begin(whole=True)
 

@@ -123,10 +123,11 @@ class GelContact:
         for search, _, _ in self._searches:
             search.reserve(search.pairs)
 
-    def begin(self, *, whole: bool = False) -> None:
+    def begin(self, *, whole: bool = False, most: int = 0) -> None:
         """Find contacts from ``frames``, choose the length of each environment's step, and set the rows of its contacts.
 
-        ``whole``: of the scene's step, which is not divided.
+        ``whole``: of the scene's step, which is not divided; else it is divided into ``most`` steps at most, with this one in what remains
+        of it, and 0 is any number.
         """
         self.move()
         for search, pad, body in self._pairs:
@@ -141,7 +142,7 @@ class GelContact:
                 search.poses.shape[1:],
                 [*results, self.motion, *shared, self.acceleration, *self._clock, self.steps, self.slots],
             )
-        self._launch(choose_steps, (), [self.motion, self.slots, *self._clock, int(whole), self.steps])
+        self._launch(choose_steps, (), [self.motion, self.slots, *self._clock, 1 if whole else most, self.steps])
         for search, *at in self._searches:
             results = [search.rows, *search.poses.shape[1:], *at, self.frames, self.motion]
             self._launch(

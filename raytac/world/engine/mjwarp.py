@@ -1,7 +1,8 @@
 """MuJoCo Warp under rigid pads: B worlds in one state, on the CPU or on CUDA, with the contacts of gels in its contact list.
 
-Nothing in a step waits for the device, so that a step can be recorded as one CUDA graph (``capture``). All worlds take steps of one
-length, and none can be left out: one that is not active, or breaks down, is put back to where the step began.
+Nothing in a step waits for the device, so that a step can be recorded as one CUDA graph (``capture``). All worlds take as many steps, each
+of its own length. None can be left out of one: a world that is not active, has done the scene's step already, or breaks down, is put back
+to where the step began.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ class MujocoWarp:
     Attributes:
         num_envs: B.
         device: of all arrays.
-        timestep: of all steps [s].
+        timestep: of the scene's steps [s].
+        active: environments that are stepped (B,), bool; those that break down are no longer.
         model, data: MuJoCo Warp's.
         peaks: most contacts of all environments at once, most pairs of MuJoCo's collision, most rows of one environment, and flags of
             overflow, (4,).
@@ -65,7 +67,7 @@ class MujocoWarp:
             model: of all environments; ``set_models`` gives them their own.
             pads: what the model calls pads and what they touch.
             num_envs: B.
-            timestep: of all steps [s]; None is the model's.
+            timestep: of the scene's steps [s], which divide into shorter ones; None is the model's.
             contacts, rows: memory for contacts and constraint rows, an environment each; None is a guess. All environments share the
                 memory for contacts. If it is too small, ``check_overflow`` raises an error.
             device: "cpu" or "cuda".
@@ -98,6 +100,7 @@ class MujocoWarp:
             self._worlds = _worlds(self.model, self.data)
             shape = num_envs, *slots
             self._own: Any = kernels.Own()
+            self.active, self._done = wp.full(num_envs, value=True, dtype=wp.bool), wp.zeros(num_envs, dtype=wp.int32)
             self._own.first, self._own.sliding = wp.zeros(1, dtype=wp.int32), wp.zeros(num_envs, dtype=wp.int32)
             self._own.contact, self._own.scale = wp.full(shape, -1, dtype=wp.int32), wp.zeros(shape, dtype=wp.float64)
             self._saved: Any = kernels.Saved()
@@ -113,11 +116,12 @@ class MujocoWarp:
             self._gels = _array(pads.geoms[len(pads.bodies) :])
 
     def _use_gel_contacts(self) -> None:
-        """Room for contacts of ``ROWS`` rows, which the model's own geoms may not have."""
+        """Room for contacts of ``ROWS`` rows, which the model's own geoms may not have, and a timestep for each environment."""
         model, data = self.model, self.data
         if model.nmaxcondim < ROWS:
             model.nmaxcondim, model.nmaxpyramid = ROWS, 2 * (ROWS - 1)
             data.contact.efc_address = wp.full((data.naconmax, model.nmaxpyramid), -1, dtype=wp.int32)
+        model.opt.timestep = wp.full(self.num_envs, self.timestep, dtype=wp.float32)
         model.opt.warn_overflow = 0  # check_overflow raises an error
         model.opt.tolerance.fill_(_TOLERANCE)
 
@@ -140,9 +144,12 @@ class MujocoWarp:
             self._mjw.fwd_actuation(self.model, self.data)
             self._mjw.fwd_acceleration(self.model, self.data)
 
-    def choose(self, active: wp.array, steps: Any) -> None:
-        """Name the environments of this step, those that are ``active`` (B,), bool."""
-        self._launch(kernels.choose_worlds, self.num_envs, [active, steps])
+    def choose(self, steps: Any, ticks: int, *, first: bool) -> None:
+        """Name the environments of this step: those that are active and have not done all ``ticks`` of the scene's step.
+
+        ``first``: a step of the scene begins.
+        """
+        self._launch(kernels.choose_worlds, self.num_envs, [self.active, self._done, int(first), ticks, steps])
 
     def read_frames(self, frames: Any) -> None:
         """Frames of pads and bodies, after ``free_acceleration``."""
@@ -153,6 +160,7 @@ class MujocoWarp:
         """Put the contacts that ``GelContact.begin`` chose among MuJoCo's own, make all constraints, and solve for the lifts of slides."""
         worlds, own, mjw = self._worlds, self._own, self._mjw
         with wp.ScopedDevice(self.device):
+            self._launch(kernels.set_timesteps, self.num_envs, [steps, self.model.opt.timestep])
             if self._damped:
                 self._add_damping(steps)
             wp.copy(own.first, self.data.nacon)
@@ -180,24 +188,29 @@ class MujocoWarp:
             if self._damped:
                 wp.copy(self.data.M, self._mass)
             self._mjw.implicit(self.model, self.data)
-            self._launch(kernels.end_states, self.num_envs, [self._worlds, self._saved, steps, self.peaks])
+        self._launch(kernels.end_states, self.num_envs, [self._worlds, self._saved, steps, self.peaks])
+        self._launch(kernels.end_worlds, self.num_envs, [steps, self._done, self.active])
 
     def read_rows(self, steps: Any, force: wp.array, velocity: wp.array) -> None:
         """Forces of the gels' rows and their velocities at the end of the step."""
         self._launch(kernels.read_rows, self._own.contact.shape, [self._worlds, self._own, steps, force, velocity])
 
-    def step(self, contact: GelContact, active: wp.array, drive: Callable[[], None] = lambda: None) -> None:
-        """One step of the environments that are ``active`` (B,), bool, with the gels' contact; ``drive`` writes controls."""
-        self.begin_step()
-        drive()
-        self.free_acceleration()
-        self.choose(active, contact.steps)
-        self.read_frames(contact.frames)
-        contact.begin(whole=True)
-        self.put_contacts(contact.slots, contact.steps)
-        self.end_step(contact.steps)
-        self.read_rows(contact.steps, contact.force, contact.velocity)
-        contact.end()
+    def step(self, contact: GelContact, drive: Callable[[], None] = lambda: None, *, most: int = 1) -> None:
+        """One step of the scene with the gels' contact; ``drive`` writes controls.
+
+        Where something moves fast near a pad it is divided, into ``most`` steps at most; all worlds pay for these.
+        """
+        for k in range(most):
+            self.begin_step()
+            drive()
+            self.free_acceleration()
+            self.choose(contact.steps, contact.ticks, first=k == 0)
+            self.read_frames(contact.frames)
+            contact.begin(most=most - k)
+            self.put_contacts(contact.slots, contact.steps)
+            self.end_step(contact.steps)
+            self.read_rows(contact.steps, contact.force, contact.velocity)
+            contact.end()
 
     def update_poses(self) -> None:
         """Poses at the present positions."""
@@ -234,7 +247,7 @@ class MujocoWarp:
         """Put the environments that are ``chosen`` (B,), bool, to positions (B, nq) and controls (B, nu), at rest and at the time 0."""
         with wp.ScopedDevice(self.device):
             self._mjw.reset_data(self.model, self.data, reset=chosen)
-        self._launch(kernels.place_states, self.num_envs, [chosen, qpos, ctrl, self._worlds])
+        self._launch(kernels.place_states, self.num_envs, [chosen, qpos, ctrl, self._worlds, self.active])
 
     def check_overflow(self) -> None:
         """Raise ``InputError`` if contacts or rows were lost since the states were made; it waits for the device."""

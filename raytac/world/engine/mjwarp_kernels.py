@@ -125,11 +125,16 @@ class Saved:
 
 @wp.kernel
 def place_states(
-    chosen: wp.array(dtype=wp.bool), qpos: wp.array2d(dtype=wp.float32), ctrl: wp.array2d(dtype=wp.float32), worlds: Worlds
+    chosen: wp.array(dtype=wp.bool),
+    qpos: wp.array2d(dtype=wp.float32),
+    ctrl: wp.array2d(dtype=wp.float32),
+    worlds: Worlds,
+    active: wp.array(dtype=wp.bool),
 ):
-    """Set positions (B, nq) and controls (B, nu) of the environments that are ``chosen``."""
+    """Set positions (B, nq) and controls (B, nu) of the environments that are ``chosen``, which are active from now on."""
     i = wp.tid()
     if chosen[i]:
+        active[i] = True
         for k in range(worlds.qpos.shape[1]):
             worlds.qpos[i, k] = qpos[i, k]
         for k in range(worlds.ctrl.shape[1]):
@@ -171,11 +176,36 @@ def save_states(worlds: Worlds, saved: Saved):
 
 
 @wp.kernel
-def choose_worlds(active: wp.array(dtype=wp.bool), steps: Steps):
-    """Every environment has its own row; one that is not ``active`` is left out."""
+def choose_worlds(
+    active: wp.array(dtype=wp.bool), done: wp.array(dtype=wp.int32), first: wp.int32, ticks: wp.int32, steps: Steps
+):
+    """Every environment has its own row, but those that are not ``active`` or have ``done`` all ``ticks`` of the scene's step are left out.
+
+    ``first``: 1 where a step of the scene begins.
+    """
     i = wp.tid()
-    steps.envs[i] = wp.where(active[i], i, -1)
-    steps.done[i] = 0
+    if first != 0:
+        done[i] = 0
+    steps.envs[i] = wp.where(active[i] and done[i] < ticks, i, -1)
+    steps.done[i] = done[i]
+
+
+@wp.kernel
+def end_worlds(steps: Steps, done: wp.array(dtype=wp.int32), active: wp.array(dtype=wp.bool)):
+    """Count the ticks of a step; an environment whose physics broke down in it is no longer ``active``."""
+    i = wp.tid()
+    if steps.envs[i] >= 0:
+        done[i] = done[i] + steps.ticks[i]
+        if steps.lost[i] != 0:
+            active[i] = False
+
+
+@wp.kernel
+def set_timesteps(steps: Steps, timestep: wp.array(dtype=wp.float32)):
+    """Give the solver the length of each environment's step; others keep theirs."""
+    i = wp.tid()
+    if steps.envs[i] >= 0:
+        timestep[i] = wp.float32(steps.length[i])
 
 
 @wp.kernel
