@@ -4,8 +4,9 @@
 
 Each arm presses its pad onto the cube and drags it along a circle: joint targets are recorded in one environment of C MuJoCo, and every
 world follows them by springs in its joints, with its cube up to 4 mm and 0.2 rad from where that of the record started. An environment step
-is a control step of 20 ms with ``--substeps`` steps of MuJoCo; on CUDA all of it is one graph. ``pressed`` says in how many of the steps
-that are timed a world's pad carried at least 0.1 N.
+is a control step of 20 ms with ``--substeps`` steps of MuJoCo, and ``--divided`` more by which a world divides them; on CUDA all of it is
+one graph. ``pressed`` says in how many of the steps that are timed a world's pad carried at least 0.1 N, and ``split`` what parts of it
+take.
 """
 
 # pyright: reportInvalidTypeForm=false, reportGeneralTypeIssues=false, reportAssignmentType=false
@@ -64,8 +65,8 @@ class Args(CommonOptions):
     """Control steps that are timed, after those in which the pads are pressed on."""
     substeps: int = 2
     """Steps of MuJoCo in a control step."""
-    most: int = 1
-    """Steps into which each of these may be divided where something moves fast near a pad."""
+    divided: int = 1
+    """Further steps for worlds in which something moves fast near a pad."""
     contacts: int | None = None
     """Memory for contacts of each environment; None is a guess."""
     rows: int | None = None
@@ -109,12 +110,12 @@ def count_step(counter: wp.array(dtype=wp.int32)):
 
 def main(args: Args) -> dict[str, Metric]:
     """Run it and write ``metrics.json``."""
-    for name in ("worlds", "steps", "substeps", "most"):
-        if getattr(args, name) < 1:
-            raise InputError(name, value=getattr(args, name), rule="must be 1 or more")
+    for name, least in (("worlds", 1), ("steps", 1), ("substeps", 1), ("divided", 0)):
+        if getattr(args, name) < least:
+            raise InputError(name, value=getattr(args, name), rule=f"must be {least} or more")
     device = resolve_device(args.device, ray_tracing=False)
     with recorded(args, "bench_gpu", device=device, owned=_OWNED, packages=("mujoco-warp", "warp-lang")) as (folder, metrics):
-        metrics |= {"worlds": args.worlds, "steps": args.steps, "substeps": args.substeps, "most": args.most, **machine()}
+        metrics |= {"worlds": args.worlds, "steps": args.steps, "substeps": args.substeps, "divided": args.divided, **machine()}
         found = timed(args, device, folder)
         where = "gpu" if device == "cuda" else "cpu"
         metrics |= {f"{where}.push.physics.{key}": value for key, value in found.items()}
@@ -233,7 +234,7 @@ class Worlds:
         qpos[:, first + 3], qpos[:, first + 6] = np.cos(turn), np.sin(turn)
         start = [qpos, np.repeat(composed.ctrl[None], count, axis=0)]
         self.engine.reset(self.engine.active, *(wp.array(values, dtype=wp.float32, device=device) for values in start))
-        self.substeps, self.most = args.substeps, args.most
+        self.substeps, self.launches = args.substeps, args.substeps + args.divided
         array = partial(wp.array, device=device)
         n = len(arm)
         known = {name: one for name, one in arm.numbers().items() if name in ("time", "joints", "speed", "bias", "mass")}
@@ -262,8 +263,7 @@ class Worlds:
         self.reader.read()
         tables = [self.joints, self.speeds, PRESS, self.counter, self.springs.time]
         wp.launch(next_targets, dim=self.springs.target.shape, inputs=[*tables, self.springs], device=device)
-        for _ in range(self.substeps):
-            engine.step(contact, self.drive, most=self.most)
+        engine.advance(contact, self.drive, scene_steps=self.substeps, launches=self.launches)
         pressed = [contact.wrenches, LEAST_FORCE, self.counts]
         wp.launch(count_pressed, dim=count, inputs=pressed, device=device)
         wp.launch(count_step, dim=1, inputs=[self.counter], device=device)
@@ -273,9 +273,9 @@ class Worlds:
         engine, contact = self.engine, self.contact
 
         def find() -> None:
-            engine.choose(contact.steps, contact.ticks, first=True)
+            engine.choose(contact.steps, contact.ticks)
             engine.read_frames(contact.frames)
-            contact.begin(whole=True)
+            contact.begin()
 
         parts: dict[str, Callable[[], None]] = {
             "begin_step": engine.begin_step,

@@ -123,11 +123,10 @@ class GelContact:
         for search, _, _ in self._searches:
             search.reserve(search.pairs)
 
-    def begin(self, *, whole: bool = False, most: int = 0) -> None:
+    def begin(self, *, whole: bool = False) -> None:
         """Find contacts from ``frames``, choose the length of each environment's step, and set the rows of its contacts.
 
-        ``whole``: of the scene's step, which is not divided; else it is divided into ``most`` steps at most, with this one in what remains
-        of it, and 0 is any number.
+        ``whole``: of the scene's step, which is not divided.
         """
         self.move()
         for search, pad, body in self._pairs:
@@ -142,7 +141,7 @@ class GelContact:
                 search.poses.shape[1:],
                 [*results, self.motion, *shared, self.acceleration, *self._clock, self.steps, self.slots],
             )
-        self._launch(choose_steps, (), [self.motion, self.slots, *self._clock, 1 if whole else most, self.steps])
+        self._launch(choose_steps, (), [self.motion, self.slots, *self._clock, int(whole), self.steps])
         for search, *at in self._searches:
             results = [search.rows, *search.poses.shape[1:], *at, self.frames, self.motion]
             self._launch(
@@ -255,7 +254,9 @@ def _array(values: Any, dtype: Any, device: Any) -> wp.array:
 
 
 _FRAMES: dict[str, Any] = dict.fromkeys(("place", "velocity", "spin", "push", "swing"), wp.vec3d) | {"turn": wp.mat33d}
-_STEPS: dict[str, Any] = dict.fromkeys(("envs", "done", "ticks", "lost", "contacts", "slides"), wp.int32) | {"length": wp.float64}
+_STEPS: dict[str, Any] = dict.fromkeys(("envs", "done", "most", "ticks", "lost", "contacts", "slides"), wp.int32) | {
+    "length": wp.float64
+}
 _MOTION: dict[str, Any] = {"pose": wp.mat44d, "velocity": wp.vec3d, "spin": wp.vec3d, "push": wp.float64}
 _SLOTS: dict[str, Any] = {
     "row": wp.int32,

@@ -141,12 +141,12 @@ def least_steps(ticks: wp.int32) -> wp.int32:
 
 
 @wp.kernel
-def choose_steps(motion: Motion, slots: Slots, timestep: wp.float64, scene_ticks: wp.int32, most: wp.int32, steps: Steps):
-    """Ticks and length of each environment's next step.
-
-    ``most``: greatest number of steps in which the rest of the scene's is done, 0 for any; from its start with 1 it is not divided.
-    """
+def choose_steps(motion: Motion, slots: Slots, timestep: wp.float64, scene_ticks: wp.int32, whole: wp.int32, steps: Steps):
+    """Ticks and length of each environment's next step; ``whole``: all of the scene's."""
     i = wp.tid()
+    most = steps.most[i] + 0
+    if whole != 0:
+        most = 1
     longest = wp.float64(timestep)
     for pad in range(slots.row.shape[1]):
         longest = wp.min(longest, motion.case_step[i, pad])
@@ -154,7 +154,7 @@ def choose_steps(motion: Motion, slots: Slots, timestep: wp.float64, scene_ticks
             if slots.row[i, pad, body] >= 0:
                 longest = wp.min(longest, slots.longest[i, pad, body])
     done, ticks = steps.done[i] + 0, wp.int32(scene_ticks)
-    if done > 0:
+    if done > 0 and whole == 0:
         ticks = done & -done
     wanted = wp.max(longest / timestep * wp.float64(scene_ticks) * _SLACK, _1)
     while wp.float64(ticks) > wanted and (most == 0 or least_steps(scene_ticks - done - ticks // 2) < most):

@@ -144,12 +144,18 @@ class MujocoWarp:
             self._mjw.fwd_actuation(self.model, self.data)
             self._mjw.fwd_acceleration(self.model, self.data)
 
-    def choose(self, steps: Any, ticks: int, *, first: bool) -> None:
-        """Name the environments of this step: those that are active and have not done all ``ticks`` of the scene's step.
+    def choose(self, steps: Any, ticks: int, *, scene_steps: int = 1, launched: int = 0, launches: int = 1) -> None:
+        """Name the environments of this step: those that are active and have not done all steps of the scene.
 
-        ``first``: a step of the scene begins.
+        Args:
+            steps: of ``GelContact``.
+            ticks: of each of the scene's steps.
+            scene_steps: number of these.
+            launched: steps that were launched for these before.
+            launches: number of all, in which they must be done.
         """
-        self._launch(kernels.choose_worlds, self.num_envs, [self.active, self._done, int(first), ticks, steps])
+        numbers = [ticks, scene_steps, launched, launches]
+        self._launch(kernels.choose_worlds, self.num_envs, [self.active, *numbers, self._done, steps])
 
     def read_frames(self, frames: Any) -> None:
         """Frames of pads and bodies, after ``free_acceleration``."""
@@ -195,18 +201,24 @@ class MujocoWarp:
         """Forces of the gels' rows and their velocities at the end of the step."""
         self._launch(kernels.read_rows, self._own.contact.shape, [self._worlds, self._own, steps, force, velocity])
 
-    def step(self, contact: GelContact, drive: Callable[[], None] = lambda: None, *, most: int = 1) -> None:
-        """One step of the scene with the gels' contact; ``drive`` writes controls.
+    def advance(
+        self, contact: GelContact, drive: Callable[[], None] = lambda: None, *, scene_steps: int = 1, launches: int | None = None
+    ) -> None:
+        """Steps of the scene with the gels' contact; ``drive`` writes controls.
 
-        Where something moves fast near a pad it is divided, into ``most`` steps at most; all worlds pay for these.
+        All worlds together take ``launches`` steps for them, as many as the scene's if None. Of more a world divides one in which something
+        moves fast near a pad.
         """
-        for k in range(most):
+        count = scene_steps if launches is None else launches
+        if count < scene_steps:
+            raise InputError("launches", value=launches, rule=f"must be {scene_steps} or more, one for each of the scene's steps")
+        for k in range(count):
             self.begin_step()
             drive()
             self.free_acceleration()
-            self.choose(contact.steps, contact.ticks, first=k == 0)
+            self.choose(contact.steps, contact.ticks, scene_steps=scene_steps, launched=k, launches=count)
             self.read_frames(contact.frames)
-            contact.begin(most=most - k)
+            contact.begin()
             self.put_contacts(contact.slots, contact.steps)
             self.end_step(contact.steps)
             self.read_rows(contact.steps, contact.force, contact.velocity)

@@ -177,17 +177,27 @@ def save_states(worlds: Worlds, saved: Saved):
 
 @wp.kernel
 def choose_worlds(
-    active: wp.array(dtype=wp.bool), done: wp.array(dtype=wp.int32), first: wp.int32, ticks: wp.int32, steps: Steps
+    active: wp.array(dtype=wp.bool),
+    ticks: wp.int32,
+    scene_steps: wp.int32,
+    launched: wp.int32,
+    launches: wp.int32,
+    # outputs
+    done: wp.array(dtype=wp.int32),
+    steps: Steps,
 ):
-    """Every environment has its own row, but those that are not ``active`` or have ``done`` all ``ticks`` of the scene's step are left out.
+    """Every environment has its own row; left out are those that are not ``active`` or have done all steps of the scene.
 
-    ``first``: 1 where a step of the scene begins.
+    ``ticks`` of each of the ``scene_steps``; ``launched``: steps before this one, of all ``launches``.
     """
     i = wp.tid()
-    if first != 0:
+    if launched == 0:
         done[i] = 0
-    steps.envs[i] = wp.where(active[i] and done[i] < ticks, i, -1)
-    steps.done[i] = done[i]
+    before = done[i] // ticks
+    steps.envs[i] = wp.where(active[i] and before < scene_steps, i, -1)
+    steps.done[i] = done[i] % ticks
+    # The scene's later steps take one launch each, if they are not divided.
+    steps.most[i] = launches - launched - (scene_steps - 1 - before)
 
 
 @wp.kernel

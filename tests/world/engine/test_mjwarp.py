@@ -30,11 +30,11 @@ CUDA = pytest.param("cuda", marks=pytest.mark.gpu)
 
 
 @cache
-def ball_on_pad(mass: float = MASSES[0]) -> mujoco.MjModel:
+def ball_on_pad(mass: float = MASSES[0], timestep: float = 1e-3) -> mujoco.MjModel:
     """A pad that lies on its back, and a ball on the middle of it."""
     spec = mujoco.MjSpec()
     option = spec.option
-    option.timestep, option.impratio, option.tolerance = 1e-3, 10.0, 1e-10
+    option.timestep, option.impratio, option.tolerance = timestep, 10.0, 1e-10
     option.cone, option.integrator = mujoco.mjtCone.mjCONE_ELLIPTIC, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     mount(spec, "gelsight_mini", body="world", name="pad", pose=np.eye(4))
     ball = spec.worldbody.add_body(name="ball", pos=(0.0, 0.0, RADIUS - 1e-4))
@@ -56,12 +56,12 @@ class Warped:
         start, ctrl = (np.repeat(values[None], count, axis=0) for values in (composed.start, composed.ctrl))
         self._start = [wp.array(values, dtype=wp.float32, device=device) for values in (start, ctrl)]
         self.reset(self.engine.active)
-        self.data, self.step = self.engine.data, partial(self.engine.step, self.contact)
+        self.data, self.step = self.engine.data, partial(self.engine.advance, self.contact)
 
     @classmethod
-    def balls(cls, masses: Sequence[float] = MASSES, device: str = "cpu", **options: Any) -> Warped:
-        composed = own_world_model(ball_on_pad(masses[0]), touches=TOUCHES)
-        return cls([ball_on_pad(mass) for mass in masses], composed, device, **options)
+    def balls(cls, masses: Sequence[float] = MASSES, device: str = "cpu", *, timestep: float = 1e-3, **options: Any) -> Warped:
+        models = [ball_on_pad(mass, timestep) for mass in masses]
+        return cls(models, own_world_model(models[0], touches=TOUCHES), device, **options)
 
     def reset(self, chosen: wp.array) -> None:
         self.engine.reset(chosen, *self._start)
@@ -121,6 +121,27 @@ def test_balls_that_are_pressed_and_dragged_move_as_in_c_mujoco(device: str) -> 
     warped.engine.check_overflow()
     assert slides > 0 and touched > 200  # lifts were corrected
     assert np.abs(warped.state()[:, 0]).min() > 1e-4
+
+
+@pytest.mark.parametrize(("launches", "fits"), [(1, False), (32, True)])
+def test_a_step_is_divided_where_a_ball_falls_onto_a_pad(launches: int, *, fits: bool) -> None:
+    """One ball hits the pad in the second step, one falls all the time; each is as in C MuJoCo, which divides as it needs."""
+    warped, model = Warped.balls((MASSES[0],) * 2, timestep=4e-3), ball_on_pad(MASSES[0], 4e-3)
+    datas, pads = [mujoco.MjData(model) for _ in range(2)], PadStepper(model, touches=TOUCHES, num_envs=2)
+    for b, height in enumerate((1e-3, 30e-3)):
+        warped.lift(b, height)
+        datas[b].qpos[2] += height
+        datas[b].qvel[2] = -0.1
+    warped.data.qvel.assign(np.array([data.qvel for data in datas]))
+    off = []
+    for _ in range(8):
+        pads.step(model, datas)
+        warped.step(launches=launches)
+        off.append(warped.state()[:, 2] - [data.qpos[2] for data in datas])
+        assert warped.wrench().any(axis=1).tolist() == pads.wrench("pad").any(axis=1).tolist()
+    assert pads.wrench("pad").any(axis=1).tolist() == [True, False]
+    np.testing.assert_allclose(warped.data.time.numpy(), 32e-3, rtol=1e-6)
+    assert np.abs(off)[:, 1].max() < 1e-6 and (np.abs(off)[:, 0].max() < 1e-5) == fits
 
 
 def test_a_world_without_touch_moves_as_mujoco_warp_alone() -> None:
