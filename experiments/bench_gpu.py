@@ -226,7 +226,7 @@ class Worlds:
         pairs = GelPairs([spec.gelpad for spec in composed.sensor_specs], pads.carriers, count, device=device).pairs
         models = EnvironmentModels(composed, count)
         self.contact = gel_contact(composed, models, pairs, num_envs=count, device=device)
-        self.engine = MujocoWarp(composed.model, pads, num_envs=count, contacts=args.contacts, rows=args.rows, device=device)
+        self.engine = MujocoWarp(self.contact, pads, models, contacts=args.contacts, rows=args.rows)
         rng, qpos = np.random.default_rng(args.seed), np.repeat(composed.start[None], count, axis=0)
         first = composed.bodies["cube"].qpos
         turn = 0.5 * rng.uniform(-0.2, 0.2, count)
@@ -263,7 +263,7 @@ class Worlds:
         self.reader.read()
         tables = [self.joints, self.speeds, PRESS, self.counter, self.springs.time]
         wp.launch(next_targets, dim=self.springs.target.shape, inputs=[*tables, self.springs], device=device)
-        engine.advance(contact, self.drive, scene_steps=self.substeps, launches=self.launches)
+        engine.advance(self.drive, scene_steps=self.substeps, launches=self.launches)
         pressed = [contact.wrenches, LEAST_FORCE, self.counts]
         wp.launch(count_pressed, dim=count, inputs=pressed, device=device)
         wp.launch(count_step, dim=1, inputs=[self.counter], device=device)
@@ -273,8 +273,8 @@ class Worlds:
         engine, contact = self.engine, self.contact
 
         def find() -> None:
-            engine.choose(contact.steps, contact.ticks)
-            engine.read_frames(contact.frames)
+            engine.choose()
+            engine.read_frames()
             contact.begin()
 
         parts: dict[str, Callable[[], None]] = {
@@ -282,9 +282,9 @@ class Worlds:
             "drive": self.drive,
             "free_acceleration": engine.free_acceleration,
             "find_contacts": find,
-            "put_contacts": partial(engine.put_contacts, contact.slots, contact.steps),
-            "end_step": partial(engine.end_step, contact.steps),
-            "read_rows": partial(engine.read_rows, contact.steps, contact.force, contact.velocity),
+            "put_contacts": engine.put_contacts,
+            "end_step": engine.end_step,
+            "read_rows": engine.read_rows,
             "shear": contact.end,
         }
         recorded_parts = {name: engine.capture(part) for name, part in parts.items()}

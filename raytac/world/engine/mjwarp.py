@@ -20,11 +20,13 @@ import warp as wp
 from raytac.errors import BackendError, InputError
 from raytac.physics.rigid.gel_contact import GelContact
 from raytac.physics.rigid.world_kernels import ROWS
-from raytac.robots.states import Numbers
+from raytac.robots.states import Numbers, body_pose, site_pose
 from raytac.warp_runtime import start_warp
 from raytac.world.engine import mjwarp_kernels as kernels
+from raytac.world.environment_models import EnvironmentModels
 from raytac.world.implicit_damping import ImplicitDamping
 from raytac.world.pad_contact import PadIndices
+from raytac.world.world_state import LARGEST_SPEED
 
 _SLIDES = 2
 """Solves for the lift of a slide that begins or ends, before that of the step."""
@@ -38,11 +40,11 @@ _VARIED = (
 
 
 class MujocoWarp:
-    """States of B environments of one model, and the steps between which pads act.
+    """States of B environments of one model in one state of MuJoCo Warp; see ``Engine``. Row i of a step is environment i.
 
     Attributes:
+        divides, device: as of ``Engine``.
         num_envs: B.
-        device: of all arrays.
         timestep: of the scene's steps [s].
         active: environments that are stepped (B,), bool; those that break down are no longer.
         model, data: MuJoCo Warp's.
@@ -50,36 +52,38 @@ class MujocoWarp:
             overflow, (4,).
     """
 
+    divides = False
+
     def __init__(
         self,
-        model: mujoco.MjModel,
+        contact: GelContact,
         pads: PadIndices,
+        models: EnvironmentModels,
         *,
-        num_envs: int,
         timestep: float | None = None,
         contacts: int | None = None,
         rows: int | None = None,
-        device: str = "cpu",
     ) -> None:
         """Make the states, all at ``qpos0``.
 
         Args:
-            model: of all environments; ``set_models`` gives them their own.
-            pads: what the model calls pads and what they touch.
-            num_envs: B.
-            timestep: of the scene's steps [s], which divide into shorter ones; None is the model's.
+            contact: the gels' contacts, on the device of all.
+            pads: what the models call pads and what they touch.
+            models: of the environments; a variation may replace one.
+            timestep: of the scene's steps [s], which divide into shorter ones; None is the models'.
             contacts, rows: memory for contacts and constraint rows, an environment each; None is a guess. All environments share the
-                memory for contacts. If it is too small, ``check_overflow`` raises an error.
-            device: "cpu" or "cuda".
+                memory for contacts. If it is too small, ``prepare`` and ``check_overflow`` raise an error.
 
         Raises:
             BackendError: MuJoCo Warp is not installed.
-            InputError: an option of the model or a part of it that MuJoCo Warp has not, or with which pads cannot act.
+            InputError: an option of the models or a part of them that MuJoCo Warp has not, or with which pads cannot act.
         """
         start_warp()
         self._mjw = mjw = _mujoco_warp()
-        self.num_envs, self.device = num_envs, wp.get_device(device)
-        model = _checked(model)
+        self._contact, self._models_now = contact, models
+        num_envs = self.num_envs = contact.steps.envs.shape[0]
+        self.device = contact.device
+        model = _checked(models[0])
         if timestep is not None:
             model.opt.timestep = timestep
         self.timestep = float(model.opt.timestep)
@@ -114,6 +118,9 @@ class MujocoWarp:
             self._sites, self._bodies, self._last = (_array(values) for values in (pads.sites, bodies, last))
             self._others, self._hard = _array(pads.geoms), _array(pads.hard)
             self._gels = _array(pads.geoms[len(pads.bodies) :])
+        self._models = [models[0]] * num_envs
+        self._take_models()
+        self._poses = self.reader({"pads": site_pose(pads.sites), "bodies": body_pose(pads.bodies)})
 
     def _use_gel_contacts(self) -> None:
         """Room for contacts of ``ROWS`` rows, which the model's own geoms may not have, and a timestep for each environment."""
@@ -126,7 +133,7 @@ class MujocoWarp:
         model.opt.tolerance.fill_(_TOLERANCE)
 
     def begin_step(self) -> None:
-        """Positions, collision and velocities, as ``mj_step1`` but for constraints."""
+        """As of ``Engine``."""
         mjw, m, d = self._mjw, self.model, self.data
         with wp.ScopedDevice(self.device):
             wp.launch(kernels.save_states, dim=self.num_envs, inputs=[self._worlds, self._saved])
@@ -139,36 +146,57 @@ class MujocoWarp:
             mjw.fwd_velocity(m, d)
 
     def free_acceleration(self) -> None:
-        """Accelerations that everything but contacts and other constraints would give, by the controls."""
+        """As of ``Engine``."""
         with wp.ScopedDevice(self.device):
             self._mjw.fwd_actuation(self.model, self.data)
             self._mjw.fwd_acceleration(self.model, self.data)
 
-    def choose(self, steps: Any, ticks: int, *, scene_steps: int = 1, launched: int = 0, launches: int = 1) -> None:
-        """Name the environments of this step: those that are active and have not done all steps of the scene.
+    def prepare(self) -> None:
+        """As of ``Engine``; it waits for the device."""
+        self._take_models()
+        self.check_overflow()
+
+    def _take_models(self) -> None:
+        """Give environments the masses, friction and mounting of their models where these were replaced."""
+        models = [self._models_now[b] for b in range(self.num_envs)]
+        if all(one is other for one, other in zip(models, self._models, strict=True)):
+            return
+        self._models = models
+        for name in _VARIED:
+            values = np.stack([getattr(one, name) for one in models])
+            if values.size:
+                array = getattr(self.model, name)
+                array.assign(values.astype(np.float32).reshape(array.numpy().shape))
+
+    def invalid(self) -> np.ndarray:
+        """As of ``Engine``; it waits for the device."""
+        fast = ~(np.abs(self.data.qvel.numpy()) < LARGEST_SPEED).all(axis=1)
+        return fast | ~np.isfinite(self.data.qpos.numpy()).all(axis=1)
+
+    def choose(self, *, scene_steps: int = 1, launched: int = 0, launches: int = 1) -> None:
+        """Name the environments of the next step: those that are active and have not done all steps of the scene.
 
         Args:
-            steps: of ``GelContact``.
-            ticks: of each of the scene's steps.
             scene_steps: number of these.
             launched: steps that were launched for these before.
             launches: number of all, in which they must be done.
         """
-        numbers = [ticks, scene_steps, launched, launches]
-        self._launch(kernels.choose_worlds, self.num_envs, [self.active, *numbers, self._done, steps])
+        numbers = [self._contact.ticks, scene_steps, launched, launches]
+        self._launch(kernels.choose_worlds, self.num_envs, [self.active, *numbers, self._done, self._contact.steps])
 
-    def read_frames(self, frames: Any) -> None:
-        """Frames of pads and bodies, after ``free_acceleration``."""
+    def read_frames(self) -> None:
+        """As of ``Engine``."""
         shape = self.num_envs, len(self._bodies)
-        self._launch(kernels.read_frames, shape, [self._worlds, self._sites, self._bodies, self._last, frames])
+        self._launch(kernels.read_frames, shape, [self._worlds, self._sites, self._bodies, self._last, self._contact.frames])
 
-    def put_contacts(self, slots: Any, steps: Any) -> None:
-        """Put the contacts that ``GelContact.begin`` chose among MuJoCo's own, make all constraints, and solve for the lifts of slides."""
+    def put_contacts(self, *, own_step: bool = True) -> None:
+        """As of ``Engine``, and make all constraints; a contact for which there is no memory is an error of ``prepare``."""
         worlds, own, mjw = self._worlds, self._own, self._mjw
+        slots, steps = self._contact.slots, self._contact.steps
         with wp.ScopedDevice(self.device):
             self._launch(kernels.set_timesteps, self.num_envs, [steps, self.model.opt.timestep])
-            if self._damped:
-                self._add_damping(steps)
+            if self._damped and own_step:
+                self._add_damping()
             wp.copy(own.first, self.data.nacon)
             self._launch(kernels.append_contacts, own.contact.shape, [worlds, steps, slots, self._gels, self._others, own])
             mjw.make_constraint(self.model, self.data)
@@ -180,15 +208,16 @@ class MujocoWarp:
                 self._launch(kernels.begin_correction, self.num_envs, [worlds, steps, own])
                 self._launch(kernels.correct_lifts, own.contact.shape, [worlds, own, steps, slots])
 
-    def _add_damping(self, steps: Any) -> None:
-        model, data = self.model, self.data
+    def _add_damping(self) -> None:
+        model, data, steps = self.model, self.data, self._contact.steps
         self._mjw.deriv_smooth_vel(model, data, self._damped_mass)
         self._launch(kernels.add_damping, self._mass.shape, [self._worlds, steps, self._damped_mass, self._mass])
         self._mjw.factor_m(model, data)
         self._mjw.solve_m(model, data, data.qacc_smooth, data.qfrc_smooth)
 
-    def end_step(self, steps: Any) -> None:
-        """Solve and integrate."""
+    def end_step(self) -> None:
+        """As of ``Engine``."""
+        steps = self._contact.steps
         with wp.ScopedDevice(self.device):
             self._mjw.solve(self.model, self.data)
             if self._damped:
@@ -197,14 +226,13 @@ class MujocoWarp:
         self._launch(kernels.end_states, self.num_envs, [self._worlds, self._saved, steps, self.peaks])
         self._launch(kernels.end_worlds, self.num_envs, [steps, self._done, self.active])
 
-    def read_rows(self, steps: Any, force: wp.array, velocity: wp.array) -> None:
-        """Forces of the gels' rows and their velocities at the end of the step."""
-        self._launch(kernels.read_rows, self._own.contact.shape, [self._worlds, self._own, steps, force, velocity])
+    def read_rows(self) -> None:
+        """As of ``Engine``."""
+        results = [self._contact.steps, self._contact.force, self._contact.velocity]
+        self._launch(kernels.read_rows, self._own.contact.shape, [self._worlds, self._own, *results])
 
-    def advance(
-        self, contact: GelContact, drive: Callable[[], None] = lambda: None, *, scene_steps: int = 1, launches: int | None = None
-    ) -> None:
-        """Steps of the scene with the gels' contact; ``drive`` writes controls.
+    def advance(self, drive: Callable[[], None] = lambda: None, *, scene_steps: int = 1, launches: int | None = None) -> None:
+        """Steps of the scene with the gels' contact, without the host; ``drive`` writes controls.
 
         All worlds together take ``launches`` steps for them, as many as the scene's if None. Of more a world divides one in which something
         moves fast near a pad.
@@ -216,18 +244,23 @@ class MujocoWarp:
             self.begin_step()
             drive()
             self.free_acceleration()
-            self.choose(contact.steps, contact.ticks, scene_steps=scene_steps, launched=k, launches=count)
-            self.read_frames(contact.frames)
-            contact.begin()
-            self.put_contacts(contact.slots, contact.steps)
-            self.end_step(contact.steps)
-            self.read_rows(contact.steps, contact.force, contact.velocity)
-            contact.end()
+            self.choose(scene_steps=scene_steps, launched=k, launches=count)
+            self.read_frames()
+            self._contact.begin()
+            self.put_contacts()
+            self.end_step()
+            self.read_rows()
+            self._contact.end()
 
     def update_poses(self) -> None:
-        """Poses at the present positions."""
+        """As of ``Engine``."""
         with wp.ScopedDevice(self.device):
             self._mjw.kinematics(self.model, self.data)
+
+    def read_poses(self) -> tuple[np.ndarray, np.ndarray]:
+        """As of ``Engine``; it waits for the device."""
+        self._poses.read()
+        return self._poses.arrays["pads"].numpy().copy(), self._poses.arrays["bodies"].numpy().copy()
 
     def reader(self, members: Mapping[str, Numbers]) -> NumberReader:
         """Reader of numbers of all environments, which are named as those of C MuJoCo's states."""
@@ -246,14 +279,6 @@ class MujocoWarp:
             step()
         graph: Any = capture.graph
         return lambda: wp.capture_launch(graph)
-
-    def set_models(self, models: Sequence[mujoco.MjModel]) -> None:
-        """Give environments the masses, friction and mounting of their own models, one each."""
-        for name in _VARIED:
-            values = np.stack([getattr(one, name) for one in models])
-            if values.size:
-                array = getattr(self.model, name)
-                array.assign(values.astype(np.float32).reshape(array.numpy().shape))
 
     def reset(self, chosen: wp.array, qpos: wp.array, ctrl: wp.array) -> None:
         """Put the environments that are ``chosen`` (B,), bool, to positions (B, nq) and controls (B, nu), at rest and at the time 0."""
