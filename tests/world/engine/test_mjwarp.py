@@ -20,6 +20,7 @@ from raytac.world.environment_models import EnvironmentModels
 from raytac.world.gel_pairs import GelPairs
 from raytac.world.pad_contact import PadIndices, gel_contact
 from raytac.world.world_model import WorldModel, own_world_model
+from tests.world.test_implicit_damping import plunger
 
 mujoco_warp = pytest.importorskip("mujoco_warp")
 from raytac.world.engine.mjwarp import MujocoWarp  # noqa: E402
@@ -154,6 +155,20 @@ def test_a_step_is_divided_where_a_ball_falls_onto_a_pad(launches: int, *, fits:
     assert pads.wrench("pad").any(axis=1).tolist() == [True, False]
     np.testing.assert_allclose(warped.data.time.numpy(), 32e-3, rtol=1e-6)
     assert np.abs(off)[:, 1].max() < 1e-6 and (np.abs(off)[:, 0].max() < 1e-5) == fits
+
+
+@pytest.mark.parametrize("kind", ["joint", "servo"])
+def test_forces_know_of_the_damping_of_a_step(kind: str) -> None:
+    """A ball on a damper that a step does not resolve, which a force pushes into a gel; C MuJoCo with pads does the same."""
+    world = plunger("implicitfast", 10e-3, kind)
+    warped, forces = Warped([world.model], world.composed), []
+    for _ in range(4):
+        wanted = world.step().wrench["pad"][0]
+        warped.step(launches=48)  # as many as C MuJoCo may need
+        np.testing.assert_allclose(warped.state()[:, 0], world.data[0].qpos[0], atol=1e-7)
+        np.testing.assert_allclose(warped.wrench()[:, 2], wanted[2], atol=1e-3)
+        forces.append(wanted[2])
+    assert forces[-1] < -1.0
 
 
 def test_a_world_without_touch_moves_as_mujoco_warp_alone() -> None:
