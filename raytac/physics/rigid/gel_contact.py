@@ -287,7 +287,9 @@ def _array(values: Any, dtype: Any, device: Any) -> wp.array:
 
 
 _FRAMES: dict[str, Any] = dict.fromkeys(("place", "velocity", "spin", "push", "swing"), wp.vec3d) | {"turn": wp.mat33d}
-_STEPS: dict[str, Any] = dict.fromkeys(("envs", "done", "ticks", "lost", "contacts", "slides"), wp.int32) | {"length": wp.float64}
+_STEPS: dict[str, Any] = dict.fromkeys(("envs", "done", "most", "ticks", "lost", "contacts", "slides"), wp.int32) | {
+    "length": wp.float64
+}
 _MOTION: dict[str, Any] = {"pose": wp.mat44d, "velocity": wp.vec3d, "spin": wp.vec3d, "push": wp.float64}
 _SLOTS: dict[str, Any] = {
     "row": wp.int32,
