@@ -8,6 +8,7 @@ from .environments import TactileVectorEnv as TactileVectorEnv
 from .lift_cube import LiftCube as LiftCube
 from .lift_cube import LiftCubeEnv as LiftCubeEnv
 from .lift_cube import LiftCubeVectorEnv as LiftCubeVectorEnv
+from .processes import one_thread as one_thread
 from .push_cube import PushCube as PushCube
 from .push_cube import PushCubeEnv as PushCubeEnv
 from .push_cube import PushCubeVectorEnv as PushCubeVectorEnv
@@ -18,7 +19,6 @@ from .roll_ball import RollBallEnv as RollBallEnv
 from .roll_ball import RollBallVectorEnv as RollBallVectorEnv
 from .sb3 import ProcessVecEnv as ProcessVecEnv
 from .sb3 import TactileVecEnv as TactileVecEnv
-from .sb3 import one_thread as one_thread
 from .scripted import SCRIPTED as SCRIPTED
 from .task_rules import Motion as Motion
 from .task_rules import Start as Start
