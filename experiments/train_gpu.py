@@ -142,9 +142,10 @@ class Training:
     def __init__(self, args: Args, touch: str, seed: int, folder: Path) -> None:
         """Begin, or go on from the folder's checkpoint. Raises ``InputError`` for a checkpoint of other settings."""
         self.args, self.touch, self.seed, self.folder = args, touch, seed, folder
+        self._start = time.perf_counter()
         self.device = "cuda" if args.device == "auto" and torch.cuda.is_available() else args.device.replace("auto", "cpu")
         self.settings = _settings(args, touch, seed)
-        self.steps, self.iteration, self.wall_s = 0, 0, 0.0
+        self.steps, self.iteration = 0, 0
         tactile: Any = {"none": None, "task": "task"}.get(touch, tuple(touch.split("+")))
         self.env = RslVecEnv(
             getattr(raytac.envs, f"{args.task}VectorEnv"),
@@ -205,11 +206,7 @@ class Training:
         collected = time.perf_counter()
         losses = self.ppo.update()
         done = time.perf_counter()
-        self.steps, self.iteration, self.wall_s = (
-            self.steps + count * self.env.num_envs,
-            self.iteration + 1,
-            self.wall_s + done - start,
-        )
+        self.steps, self.iteration = self.steps + count * self.env.num_envs, self.iteration + 1
         return {
             "steps": self.steps, "wall_s": round(self.wall_s, 2), "reward": reward / count, "ended": ended,
             "success": succeeded / ended if ended else 0.0, "succeeding": succeeding / count, "failed": failed,
@@ -231,7 +228,7 @@ class Training:
 
     def evaluate(self, episodes: int, first_seed: int = 0) -> Evaluation:
         """Play held-out episodes, then begin new ones of the training."""
-        env, policy, done_s = self.env, self.ppo.get_policy(), 0.0
+        env, policy = self.env, self.ppo.get_policy()
         returns, lengths, successes, failures, played = [], [], 0, 0, 0
         with torch.inference_mode():
             while played < episodes:
@@ -252,7 +249,7 @@ class Training:
         result = Evaluation(played, successes, failures, float(np.mean(returns)), float(np.mean(lengths)))
         low, high = wilson_interval(successes, played)
         row = {
-            "steps": self.steps, "wall_s": round(self.wall_s + done_s, 2), "episodes": played, "success": successes / played,
+            "steps": self.steps, "wall_s": round(self.wall_s, 2), "episodes": played, "success": successes / played,
             "low": round(low, 4), "high": round(high, 4), "failed": failures, "return": round(result.mean_return, 2),
             "length": round(result.mean_length, 1),
         }  # fmt: skip
@@ -274,7 +271,7 @@ class Training:
         path = self.folder / "checkpoint.pt"
         try:
             saved = torch.load(path, map_location=self.device, weights_only=True)
-            settings, self.steps, self.iteration, self.wall_s = (saved[k] for k in ("settings", "steps", "iteration", "wall_s"))
+            settings, self.steps, self.iteration, spent = (saved[k] for k in ("settings", "steps", "iteration", "wall_s"))
         except Exception as error:
             raise InputError("out", value=path, rule=f"must be a checkpoint of train_gpu ({error})") from error
         if settings != self.settings:
@@ -282,9 +279,15 @@ class Training:
             raise InputError(
                 "out", value=self.folder, rule=f"holds a training of other settings, with {other}: name another folder"
             )
+        self._start -= spent
         self.ppo.load(saved, None, True)
         for name in ("progress.csv", "evaluation.csv"):
             _keep_rows(self.folder / name, self.steps)
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds from the start, those before a resume too: worlds, compilation, rollouts, updates and evaluations."""
+        return time.perf_counter() - self._start
 
     def close(self) -> None:
         """End the processes of the environments."""
@@ -298,7 +301,6 @@ def train(args: Args, touch: str, seed: int, folder: Path) -> None:
     start, total = time.perf_counter(), STEPS[args.task] if args.steps is None else args.steps
     with FolderLock(folder), contextlib.closing(Training(args, touch, seed, folder)) as training:
         name, reached = f"{args.task} {touch} seed {seed}", False
-        each = args.rollout * args.num_envs
         due = training.steps + args.evaluate_every
         while training.steps < total and not reached:
             row = training.iterate()
@@ -309,7 +311,7 @@ def train(args: Args, touch: str, seed: int, folder: Path) -> None:
                     f"of {row['ended']:.0f}, deviation {row['deviation']:.2f}, {row['env_steps_per_s']:.0f} steps/s",
                     flush=True,
                 )
-            if training.steps >= due or training.steps + each > total:
+            if due <= training.steps < total:
                 due = training.steps + args.evaluate_every
                 result = training.evaluate(min(args.episodes, args.num_envs))
                 training.save()
@@ -317,15 +319,19 @@ def train(args: Args, touch: str, seed: int, folder: Path) -> None:
                 reached = args.target is not None and result.successes >= args.target * result.episodes
             if args.minutes is not None and time.perf_counter() - start > 60.0 * args.minutes:
                 break
+        trained_s = training.wall_s
         result = training.evaluate(args.episodes, first_seed=10**6)
         training.save()
         low, high = wilson_interval(result.successes, result.episodes)
         found: dict[str, Metric] = {
-            "env_steps": training.steps, "minutes": training.wall_s / 60.0, "episodes": result.episodes, "failed": result.failures,
+            "env_steps": training.steps, "minutes": trained_s / 60.0, "episodes": result.episodes, "failed": result.failures,
             "success": result.successes / result.episodes, "success_low": low, "success_high": high, "return": result.mean_return,
-            "length": result.mean_length, "env_steps_per_s": training.steps / max(training.wall_s, 1e-9), "processes": args.processes,
+            "length": result.mean_length, "env_steps_per_s": training.steps / trained_s, "processes": args.processes,
         }  # fmt: skip
-        write_metrics(folder / "metrics.json", {**found, "wall_s": time.perf_counter() - start} | {"device": training.device} | versions(("rsl_rl_lib", "torch")))
+        write_metrics(
+            folder / "metrics.json",
+            {**found, "wall_s": time.perf_counter() - start} | {"device": training.device} | versions(("rsl_rl_lib", "torch")),
+        )
         print(
             f"{name}: success {result.successes}/{result.episodes} ({low:.2f} to {high:.2f}) after {training.steps} steps",
             flush=True,
