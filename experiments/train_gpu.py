@@ -13,7 +13,7 @@ Worlds are stepped on the CPU, in ``--processes`` processes; ``--device`` is tha
 """
 
 # pyright: reportMissingImports=false
-# (rsl_rl and PyTorch are not among what the tests need.)
+# (rsl_rl and PyTorch belong to the extra "rl", which the tests do without.)
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from rsl_rl.storage import RolloutStorage
 import raytac.envs
 from experiments.running import run
 from raytac.checks import check_number, check_whole
-from raytac.envs.rsl import RslVecEnv
+from raytac.envs import RslVecEnv
 from raytac.errors import InputError
 from raytac.io import (
     VERSIONED,

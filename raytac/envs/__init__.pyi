@@ -5,6 +5,7 @@ from .batch import StepResult as StepResult
 from .batch import TaskBatch as TaskBatch
 from .environments import TactileEnv as TactileEnv
 from .environments import TactileVectorEnv as TactileVectorEnv
+from .flat import FlatVector as FlatVector
 from .lift_cube import LiftCube as LiftCube
 from .lift_cube import LiftCubeEnv as LiftCubeEnv
 from .lift_cube import LiftCubeVectorEnv as LiftCubeVectorEnv
@@ -17,6 +18,7 @@ from .registration import register_envs as register_envs
 from .roll_ball import RollBall as RollBall
 from .roll_ball import RollBallEnv as RollBallEnv
 from .roll_ball import RollBallVectorEnv as RollBallVectorEnv
+from .rsl import RslVecEnv as RslVecEnv
 from .sb3 import ProcessVecEnv as ProcessVecEnv
 from .sb3 import TactileVecEnv as TactileVecEnv
 from .scripted import SCRIPTED as SCRIPTED

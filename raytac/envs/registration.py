@@ -12,7 +12,7 @@ except ModuleNotFoundError as error:
     raise BackendError("Gymnasium is not installed: pip install 'raytac[rl]'") from error
 
 _MODULES: Final = {"PushCube": "push_cube", "BalancePole": "balance_pole", "LiftCube": "lift_cube", "RollBall": "roll_ball"}
-_VERSIONS: Final = {"PushCube": 0, "BalancePole": 0, "LiftCube": 1, "RollBall": 1}
+_VERSIONS: Final = {"PushCube": 0, "BalancePole": 1, "LiftCube": 1, "RollBall": 1}
 """A task has one version, which its docstring tells the history of; Gymnasium names it to who asks for an older one."""
 _NAMES: Final = {name: f"raytac/{name}-v{version}" for name, version in _VERSIONS.items()}
 IDS: Final = tuple(_NAMES.values())

@@ -1,7 +1,7 @@
 """Environments for rsl_rl: vectors of ours, in this process or in several, as its ``VecEnv``."""
 
 # pyright: reportMissingImports=false
-# (rsl_rl and PyTorch belong to the extra "gpu", which the tests do without.)
+# (rsl_rl and PyTorch belong to the extra "rl", which the tests do without.)
 
 from __future__ import annotations
 

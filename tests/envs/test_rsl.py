@@ -1,7 +1,7 @@
 """Environments for rsl_rl and training with them: the same numbers in processes, ends, exact resuming, bad options."""
 
 # pyright: reportMissingImports=false
-# (rsl_rl and PyTorch are not among what the tests need.)
+# (rsl_rl and PyTorch belong to the extra "rl", which the tests do without.)
 
 from __future__ import annotations
 
