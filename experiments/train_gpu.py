@@ -20,6 +20,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
+import multiprocessing
 import sys
 import time
 from collections.abc import Mapping
@@ -28,15 +29,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from rsl_rl.algorithms import PPO
-from rsl_rl.models import MLPModel
-from rsl_rl.storage import RolloutStorage
 
 import raytac.envs
 from experiments.running import run
 from raytac.checks import check_number, check_whole
-from raytac.envs import RslVecEnv
 from raytac.errors import InputError
 from raytac.io import (
     VERSIONED,
@@ -50,6 +46,14 @@ from raytac.io import (
     write_metrics,
 )
 from raytac.report import machine, wilson_interval
+
+if multiprocessing.parent_process() is None:  # processes of environments import this file too, and need none of these
+    import torch
+    from rsl_rl.algorithms import PPO
+    from rsl_rl.models import MLPModel
+    from rsl_rl.storage import RolloutStorage
+
+    from raytac.envs import RslVecEnv
 
 TASKS = ("PushCube", "BalancePole", "LiftCube", "RollBall")
 HISTORY = {"BalancePole": 3, "RollBall": 3}
