@@ -57,8 +57,8 @@ class FlatVector:
         actor = now * history
         # The terms are known by name once a step was taken.
         self.env.reset(seed=[seed + b for b in range(num_envs)])
-        told = self.env.step(np.zeros((num_envs, batch.control.size)))[4]["reward_terms"]
-        terms = tuple(name for name in told if not name.startswith("_"))
+        given = self.env.step(np.zeros((num_envs, batch.control.size)))[4]["reward_terms"]
+        terms = tuple(name for name in given if not name.startswith("_"))
         scalars: dict[str, tuple[int, ...]] = dict.fromkeys(("age", "reward", "terminated", "truncated", "success", "failed"), ())
         fields = {
             "action": (batch.control.size,),
