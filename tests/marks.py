@@ -64,6 +64,7 @@ PLACES: dict[str, tuple[str, ...]] = {
     ),
     "script": (
         "dataset/test_ray_cluster.py",
+        "envs/test_rsl.py",
         "envs/test_sb3.py",
         "examples",
         "experiments",

@@ -5,6 +5,7 @@ from .batch import StepResult as StepResult
 from .batch import TaskBatch as TaskBatch
 from .environments import TactileEnv as TactileEnv
 from .environments import TactileVectorEnv as TactileVectorEnv
+from .flat import FlatVector as FlatVector
 from .insert_peg import InsertPeg as InsertPeg
 from .insert_peg import InsertPegEnv as InsertPegEnv
 from .insert_peg import InsertPegVectorEnv as InsertPegVectorEnv
@@ -14,6 +15,7 @@ from .lift_cube import LiftCubeVectorEnv as LiftCubeVectorEnv
 from .open_drawer import OpenDrawer as OpenDrawer
 from .open_drawer import OpenDrawerEnv as OpenDrawerEnv
 from .open_drawer import OpenDrawerVectorEnv as OpenDrawerVectorEnv
+from .processes import one_thread as one_thread
 from .push_cube import PushCube as PushCube
 from .push_cube import PushCubeEnv as PushCubeEnv
 from .push_cube import PushCubeVectorEnv as PushCubeVectorEnv
@@ -22,9 +24,9 @@ from .registration import register_envs as register_envs
 from .roll_ball import RollBall as RollBall
 from .roll_ball import RollBallEnv as RollBallEnv
 from .roll_ball import RollBallVectorEnv as RollBallVectorEnv
+from .rsl import RslVecEnv as RslVecEnv
 from .sb3 import ProcessVecEnv as ProcessVecEnv
 from .sb3 import TactileVecEnv as TactileVecEnv
-from .sb3 import one_thread as one_thread
 from .scripted import SCRIPTED as SCRIPTED
 from .task_rules import Motion as Motion
 from .task_rules import Start as Start
