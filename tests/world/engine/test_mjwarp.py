@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from copy import copy
 from functools import cache
@@ -15,8 +16,9 @@ import warp as wp
 from raytac import PadStepper, mount
 from raytac.errors import InputError
 from raytac.robots.frames import body_poses, site_poses
+from raytac.specs import load_task
 from raytac.world.compose import compose
-from raytac.world.environment_models import EnvironmentModels
+from raytac.world.environment_models import EnvironmentModels, Variation
 from raytac.world.gel_pairs import GelPairs
 from raytac.world.pad_contact import PadIndices, gel_contact
 from raytac.world.world_model import WorldModel, own_world_model
@@ -254,8 +256,6 @@ def test_an_option_with_which_pads_cannot_act_is_refused() -> None:
 
 @pytest.mark.parametrize("task", ["push_cube", "balance_pole", "lift_cube", "roll_ball"])
 def test_models_of_the_tasks_are_taken(task: str) -> None:
-    from raytac.specs import load_task
-
     composed = compose(load_task(task), "rigid")
     engine = Warped([composed.model] * 2, composed).engine
     assert engine.data.qpos.shape == (2, composed.model.nq) and engine.model.nmaxcondim == 6
@@ -269,6 +269,33 @@ def test_models_of_the_tasks_are_taken(task: str) -> None:
     for found, body in zip(bodies[1], composed.touched, strict=True):
         np.testing.assert_allclose(found, body_poses([state], body.index)[0], atol=1e-6)
     assert not engine.invalid().any()
+
+
+@pytest.mark.parametrize(("task", "body"), [("push_cube", "cube"), ("lift_cube", "object")])
+def test_a_variation_reaches_all_that_mujoco_derives_from_it(task: str, body: str) -> None:
+    composed = compose(load_task(task), "rigid")
+    models, pads = EnvironmentModels(composed, 2), PadIndices.of(composed)
+    contact = gel_contact(composed, models, [], num_envs=2)
+    engine = MujocoWarp(contact, pads, models)
+    sensor, shift = composed.sensors[0].name, np.eye(4)
+    shift[:3, 3] = 1e-3, -2e-3, 0.5e-3
+    factors = {body: np.array([1.7])}
+    models.vary([1], Variation(mass=factors, friction=factors, mounting={sensor: shift[None]}))
+    engine.prepare()
+    fields = [f.name for f in dataclasses.fields(engine.model) if isinstance(getattr(engine.model, f.name), wp.array)]
+    shared = [name for name in fields if isinstance(getattr(models[0], name, None), np.ndarray)]
+    assert {"body_mass", "geom_friction", "body_pos", "dof_invweight0"} <= set(shared)
+    for name in shared:
+        one, two = (np.asarray(getattr(models[b], name), np.float32).ravel() for b in range(2))
+        if not np.array_equal(one, two):
+            found = getattr(engine.model, name).numpy().reshape(2, -1)
+            np.testing.assert_array_equal(found, [one, two], err_msg=name)
+    engine.reset(engine.active, *(wp.array(np.stack([v, v]), dtype=wp.float32) for v in (composed.start, composed.ctrl)))
+    engine.update_poses()
+    state = mujoco.MjData(models[1])
+    composed.reset(models[1], state)
+    mujoco.mj_kinematics(models[1], state)
+    np.testing.assert_allclose(engine.read_poses()[0][1, 0], site_poses([state], int(pads.sites[0]))[0], atol=1e-6)
 
 
 @pytest.mark.gpu
