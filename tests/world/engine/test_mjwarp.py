@@ -30,16 +30,16 @@ from raytac.world.engine.mjwarp import MujocoWarp  # noqa: E402
 G, RADIUS = 9.81, 5e-3
 MASSES = 0.05, 0.02
 TOUCHES = {"ball": 0.3}
-CUDA = pytest.param("cuda", marks=pytest.mark.gpu)
 
 
 @cache
-def ball_on_pad(mass: float = MASSES[0], timestep: float = 1e-3) -> mujoco.MjModel:
+def ball_on_pad(mass: float = MASSES[0], timestep: float = 1e-3, jacobian: str = "dense") -> mujoco.MjModel:
     """A pad that lies on its back, and a ball on the middle of it."""
     spec = mujoco.MjSpec()
     option = spec.option
     option.timestep, option.impratio, option.tolerance = timestep, 10.0, 1e-10
     option.cone, option.integrator = mujoco.mjtCone.mjCONE_ELLIPTIC, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{jacobian.upper()}")
     mount(spec, "gelsight_mini", body="world", name="pad", pose=np.eye(4))
     ball = spec.worldbody.add_body(name="ball", pos=(0.0, 0.0, RADIUS - 1e-4))
     ball.add_freejoint()
@@ -74,8 +74,16 @@ class Warped:
         self.data, self.step = self.engine.data, self.engine.advance
 
     @classmethod
-    def balls(cls, masses: Sequence[float] = MASSES, device: str = "cpu", *, timestep: float = 1e-3, **options: Any) -> Warped:
-        models = [ball_on_pad(mass, timestep) for mass in masses]
+    def balls(
+        cls,
+        masses: Sequence[float] = MASSES,
+        device: str = "cpu",
+        *,
+        timestep: float = 1e-3,
+        jacobian: str = "dense",
+        **options: Any,
+    ) -> Warped:
+        models = [ball_on_pad(mass, timestep, jacobian) for mass in masses]
         return cls(models, own_world_model(models[0], touches=TOUCHES), device, **options)
 
     def reset(self, chosen: wp.array) -> None:
@@ -109,10 +117,17 @@ def drag(step: int, mass: float) -> np.ndarray:
     return force
 
 
-@pytest.mark.parametrize("device", ["cpu", CUDA])
-def test_balls_that_are_pressed_and_dragged_move_as_in_c_mujoco(device: str) -> None:
+@pytest.mark.parametrize(
+    ("device", "jacobian"),
+    [
+        ("cpu", "dense"),
+        pytest.param("cpu", "sparse", marks=pytest.mark.slow),
+        pytest.param("cuda", "dense", marks=pytest.mark.gpu),
+    ],
+)
+def test_balls_that_are_pressed_and_dragged_move_as_in_c_mujoco(device: str, jacobian: str) -> None:
     """Two masses; the gel sticks, slips and sticks again."""
-    warped, slides, touched = Warped.balls(device=device), 0, 0
+    warped, slides, touched = Warped.balls(device=device, jacobian=jacobian), 0, 0
     worlds = [(model, mujoco.MjData(model), PadStepper(model, touches=TOUCHES)) for model in map(ball_on_pad, MASSES)]
     for step in range(120):
         forces = np.array([drag(step, mass) for mass in MASSES])
