@@ -64,7 +64,7 @@ class TactileWorld:
     Attributes:
         scene: the task scene; None of a model of one's own.
         physics: configuration that is used.
-        model, data: MuJoCo's model of the scene, and its state in every environment.
+        model: MuJoCo's model of the scene.
         models: the model of every environment: the scene's own, or another one after a ``reset`` with a variation.
         arm: the joints that move the robot's site; None without joints.
         composed: names and indices of the scene's parts in the model.
@@ -169,7 +169,7 @@ class TactileWorld:
             pitch=pitch,
         )
         self.model = self.composed.model
-        self.data = tuple(mujoco.MjData(self.model) for _ in range(num_envs))
+        self._data = tuple(mujoco.MjData(self.model) for _ in range(num_envs))
         self.models = EnvironmentModels(self.composed, num_envs)
         self.arm: Arm | None = self.composed.arm
         self._reader = StateReader(self.data, self._numbers())
@@ -203,6 +203,11 @@ class TactileWorld:
 
     def close(self) -> None:
         """Do nothing, any number of times: memory and kernels go with the last reference, and no file, thread or window is held."""
+
+    @property
+    def data(self) -> tuple[mujoco.MjData, ...]:
+        """MuJoCo's state in every environment."""
+        return self._data
 
     @property
     def sensors(self) -> dict[str, TactileSensor]:
@@ -263,7 +268,7 @@ class TactileWorld:
             self.models.check(variation, len(chosen), rigid=not self.physics.is_simulated)
         if joints is None and not starts and variation is None and not self.models.differ(chosen):
             self._start_over(chosen)
-            self._pads.reset(chosen, self.data)
+            self._pads.reset(chosen)
         else:
             self._start_elsewhere(chosen, joints, starts, variation)
         self._frames.reset(chosen)
@@ -278,7 +283,7 @@ class TactileWorld:
             self.models.vary(envs, variation)
         self._start_over(envs, joints, bodies)
         try:
-            self._pads.reset(envs, self.data, bodies)
+            self._pads.reset(envs, bodies)
         except OverlapError:
             self.models.restore(models)
             for b, data in zip(envs, before, strict=True):
@@ -340,7 +345,7 @@ class TactileWorld:
             rule = "must be stepped by one thread at a time; each thread may have a world of its own"
             raise InputError("world", value="stepped by another thread", rule=rule)
         try:
-            self._pads.advance(self.data, drive, self._failed)
+            self._pads.advance(drive, self._failed)
         finally:
             self._stepped.release()
         return self.state()
@@ -391,7 +396,7 @@ class TactileWorld:
             InputError: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
         """
         return self._frames.observe(
-            lambda name, grid, rows: self._pads.reading(name, grid, self.data, self._failed, rows), self._failed, sensors, envs
+            lambda name, grid, rows: self._pads.reading(name, grid, self._failed, rows), self._failed, sensors, envs
         )
 
     def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -464,7 +469,7 @@ class TactileWorld:
                 names = [model.body(int(model.geom_bodyid[g])).name or "world" for g in contact.geom]
                 rule = f"overlap by {-contact.dist * 1e3:.3g} mm at the start: move one of them in the scene"
                 raise InputError("bodies", value=tuple(names), rule=rule)
-        for sensor, body, depth in self._pads.overlap(data):
+        for sensor, body, depth in self._pads.overlap(0):
             if depth > (_OVERLAP if self.scene is not None else np.inf) or np.isinf(depth):
                 rule = f"must not be pressed into the pad of {sensor!r} at the start; it is, by {depth * 1e3:.3g} mm"
                 if np.isinf(depth):
