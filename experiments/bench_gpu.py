@@ -2,11 +2,10 @@
 
     python experiments/bench_gpu.py --worlds 4096 --steps 200 --device cuda --out runs/bench_gpu
 
-Each arm presses its pad onto the cube and drags it along a circle: joint targets are recorded in one environment of C MuJoCo, and every
-world follows them by springs in its joints, with its cube up to 4 mm and 0.2 rad from where that of the record started. An environment step
-is a control step of 20 ms with ``--substeps`` steps of MuJoCo, and ``--divided`` more by which a world divides them; on CUDA all of it is
-one graph. ``pressed`` says in how many of the steps that are timed a world's pad carried at least 0.1 N, and ``split`` what parts of it
-take.
+Each arm presses its pad onto the cube and drags it along a circle: every world follows the same joint targets by springs in its joints,
+with its cube up to 4 mm and 0.2 rad from where the scene has it. An environment step is a control step of 20 ms with ``--substeps`` steps
+of MuJoCo, and ``--divided`` more by which a world divides them; on CUDA all of it is one graph. ``pressed`` says in how many of the steps
+that are timed a world's pad carried at least 0.1 N, and ``split`` what the parts of a step take.
 """
 
 # pyright: reportInvalidTypeForm=false, reportGeneralTypeIssues=false, reportAssignmentType=false
@@ -15,11 +14,9 @@ take.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -29,28 +26,14 @@ from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io import CommonOptions, Metric
 from raytac.report import machine
-from raytac.robots.arm_kernels import Springs, joint_springs
-from raytac.robots.ik import PoseServo
-from raytac.robots.impedance import JointImpedance
-from raytac.robots.joint_springs import JointSprings
-from raytac.robots.panda import MAX_VELOCITY
+from raytac.robots import DifferentialIk
 from raytac.specs import TaskScene, load_task
-from raytac.world.compose import compose
-from raytac.world.engine.mjwarp import MujocoWarp
-from raytac.world.environment_models import EnvironmentModels
-from raytac.world.gel_pairs import GelPairs
-from raytac.world.pad_contact import PadIndices, gel_contact
-from raytac.world.world import TactileWorld
-from raytac.world.world_model import WorldModel
-from raytac.world.world_state import BatchController
+from raytac.world import WarpWorld
 
 PRESS, CIRCLE = 20, 150
 """Control steps in which the pad is pressed on, and of one turn."""
 DEPTH, RADIUS = 2.9e-3, 0.015
 """Path down from 2 mm above the cube, and radius of the circle [m]."""
-FREQUENCY = 30.0
-"""Of the springs in the joints [rad/s]."""
-_OWNED = "metrics.json", "targets.npz"
 LEAST_FORCE = 0.1
 """Of a pad that is pressed [N]."""
 
@@ -72,40 +55,41 @@ class Args(CommonOptions):
     rows: int | None = None
     """Memory for constraint rows of each environment; None is a guess."""
     targets: Path | None = None
-    """``targets.npz`` of another run, so that C MuJoCo need not run before."""
+    """``targets.npy`` of another run, joints (steps, 7), so that no inverse kinematics is needed."""
 
 
 @wp.kernel
 def next_targets(
-    joints: wp.array2d(dtype=wp.float64),
-    speeds: wp.array2d(dtype=wp.float64),
+    table: wp.array2d(dtype=wp.float64),
     press: wp.int32,
+    timestep: wp.float64,
     counter: wp.array(dtype=wp.int32),
-    time: wp.array(dtype=wp.float64),
     # outputs
-    springs: Springs,
+    target: wp.array2d(dtype=wp.float64),
+    speed: wp.array2d(dtype=wp.float64),
 ):
-    """Targets of this control step, from tables (steps, n): those after ``press`` again and again."""
+    """Targets of this control step, from a table (steps + 1, n): those after ``press`` again and again."""
     i, k = wp.tid()
     row = counter[0] + 0
     if row >= press:
-        row = press + (row - press) % (joints.shape[0] - press)
-    springs.target[i, k] = joints[row, k]
-    springs.target_speed[i, k] = speeds[row, k]
-    springs.start[i] = time[i]
+        row = press + (row - press) % (table.shape[0] - 1 - press)
+    target[i, k] = table[row, k]
+    speed[i, k] = (table[row + 1, k] - table[row, k]) / timestep
 
 
 @wp.kernel
-def count_pressed(wrenches: wp.array2d(dtype=wp.spatial_vectord), least: wp.float64, counts: wp.array(dtype=wp.int32)):
-    """Add up pads that are pressed."""
+def count_pressed(
+    wrenches: wp.array2d(dtype=wp.spatial_vectord),
+    least: wp.float64,
+    counts: wp.array(dtype=wp.int32),
+    counter: wp.array(dtype=wp.int32),
+):
+    """Add up pads that are pressed, and the control steps."""
     i = wp.tid()
     if -wrenches[i, 0][2] >= least:
         wp.atomic_add(counts, 0, 1)
-
-
-@wp.kernel
-def count_step(counter: wp.array(dtype=wp.int32)):
-    counter[0] = counter[0] + 1
+    if i == 0:
+        counter[0] = counter[0] + 1
 
 
 def main(args: Args) -> dict[str, Metric]:
@@ -113,10 +97,10 @@ def main(args: Args) -> dict[str, Metric]:
     for name, least in (("worlds", 1), ("steps", 1), ("substeps", 1), ("divided", 0)):
         if getattr(args, name) < least:
             raise InputError(name, value=getattr(args, name), rule=f"must be {least} or more")
-    device = resolve_device(args.device, ray_tracing=False)
-    with recorded(args, "bench_gpu", device=device, owned=_OWNED, packages=("mujoco-warp", "warp-lang")) as (folder, metrics):
+    device, owned = resolve_device(args.device, ray_tracing=False), ("metrics.json", "targets.npy")
+    with recorded(args, "bench_gpu", device=device, owned=owned, packages=("mujoco-warp", "warp-lang")) as (folder, metrics):
         metrics |= {"worlds": args.worlds, "steps": args.steps, "substeps": args.substeps, "divided": args.divided, **machine()}
-        found = timed(args, device, folder)
+        found = timed(args, folder)
         where = "gpu" if device == "cuda" else "cpu"
         metrics |= {f"{where}.push.physics.{key}": value for key, value in found.items()}
         for key, value in found.items():
@@ -124,19 +108,14 @@ def main(args: Args) -> dict[str, Metric]:
     return metrics
 
 
-def timed(args: Args, device: str, folder: Path) -> dict[str, Metric]:
+def timed(args: Args, folder: Path) -> dict[str, Metric]:
     """Keys of the benchmark; ``folder`` gets the targets."""
-    scene = scene_of(args)
-    if args.targets is None:
-        joints, speeds = record(TactileWorld(scene, outputs=()))
-    else:
-        stored = np.load(args.targets)
-        joints, speeds = stored["joints"], stored["speeds"]
-    np.savez(folder / "targets.npz", joints=joints, speeds=speeds)
-    begin, where = time.perf_counter(), wp.get_device(device)
-    free = where.free_memory if where.is_cuda else 0
-    bench = Worlds(compose(scene, "rigid"), args, device, joints, speeds)
-    step = bench.engine.capture(bench.control_step)
+    begin = time.perf_counter()
+    bench = Bench(args, None if args.targets is None else np.load(args.targets))
+    np.save(folder / "targets.npy", bench.table.numpy())
+    engine = bench.world.engine
+    where = engine.device
+    step = engine.capture(bench.control_step)
     for _ in range(PRESS + CIRCLE // 5):
         step()
     wp.synchronize_device(where)
@@ -147,25 +126,21 @@ def timed(args: Args, device: str, folder: Path) -> dict[str, Metric]:
         step()
     wp.synchronize_device(where)
     wall = time.perf_counter() - begin
-    bench.engine.check_overflow()
-    pressed = int(bench.counts.numpy()[0])
-    memory = (free - where.free_memory) / 1e9 if where.is_cuda else 0.0
-    split = bench.split(args.steps // 10 + 1)
-    lost = int((~bench.engine.active.numpy()).sum())
-    finite = bool(np.isfinite(bench.engine.data.qpos.numpy()).all())
-    peaks = bench.engine.peaks.numpy().tolist()
+    bench.world.check()
+    pressed, memory = int(bench.counts.numpy()[0]), (where.total_memory - where.free_memory) / 1e9 if where.is_cuda else 0.0
+    peaks = engine.peaks.numpy().tolist()
     return {
         "env_steps_per_s": args.worlds * args.steps / wall,
         "ms_per_step": 1e3 * wall / args.steps,
         "pressed": pressed / (args.worlds * args.steps),
-        "lost": lost,
-        "finite": int(finite),
+        "lost": int((~engine.active.numpy()).sum()),
+        "finite": int(np.isfinite(engine.data.qpos.numpy()).all()),
         "contacts_per_world": peaks[0] / args.worlds,
         "pairs_per_world": peaks[1] / args.worlds,
         "most_rows": peaks[2],
         "memory_gb": memory,
         "prepared_s": prepared,
-        **{f"split.{name}_ms": value for name, value in split.items()},
+        **{f"split.{name}_ms": value for name, value in bench.split(args.steps // 10 + 1).items()},
     }
 
 
@@ -175,36 +150,20 @@ def scene_of(args: Args) -> TaskScene:
     return replace(scene, timestep=scene.control_timestep / args.substeps)
 
 
-def record(world: TactileWorld) -> tuple[np.ndarray, np.ndarray]:
-    """Joint targets (steps, n) and their speeds with which the pad is pressed on and goes round."""
-    arm, dt = world.arm, world.control_timestep
+def joint_table(world: WarpWorld) -> np.ndarray:
+    """Joints (steps + 1, n) with which the pad is pressed on and goes round."""
+    composed, arm = world.composed, world.composed.arm
     assert arm is not None
-    servo = PoseServo(arm, max_velocity=np.array(MAX_VELOCITY), posture=world.composed.start[arm.qpos])
-    springs = JointImpedance(arm, frequency=FREQUENCY).springs(world.data)
-    start = arm.world_from_site(world.data[0])
-    follow = Follow(springs)
-    joints, speeds = [], []
-    for k in range(PRESS + CIRCLE):
-        before, after = (pose_at(start, m) for m in (k, k + 1))
-        twist = np.concatenate([(after - before)[None, :3, 3] / dt, np.zeros((1, 3))], axis=1)
-        target, speed = servo.targets(world.data, before[None], twist, dt)
-        joints.append(target[0].copy())
-        speeds.append(speed[0].copy())
-        springs.aim(target, speed, np.array([data.time for data in world.data]))
-        world.step(follow)
-    if world.failed.any():
-        raise InputError("record", value="failed", rule="must run through in C MuJoCo")
-    return np.array(joints), np.array(speeds)
-
-
-class Follow(BatchController):
-    """Springs in the joints of all environments."""
-
-    def __init__(self, springs: JointSprings) -> None:
-        self._springs = springs
-
-    def drive(self, datas: Sequence[Any], envs: Sequence[int] | np.ndarray) -> None:
-        self._springs.drive(envs)
+    ik, qpos = DifferentialIk(arm), composed.start.copy()
+    start = world.engine.read_poses()[0][0, 0]
+    result = []
+    for step in range(PRESS + CIRCLE + 1):
+        found = ik.reach(qpos, pose_at(start, step), position_tolerance=1e-6, rotation_tolerance=1e-6)
+        if not found.reached:
+            raise InputError("pose_at", value=step, rule="must be within the arm's reach")
+        qpos[arm.qpos] = found.joints
+        result.append(found.joints)
+    return np.array(result)
 
 
 def pose_at(start: np.ndarray, step: int) -> np.ndarray:
@@ -216,61 +175,39 @@ def pose_at(start: np.ndarray, step: int) -> np.ndarray:
     return pose
 
 
-class Worlds:
-    """Worlds on MuJoCo Warp, and what happens in a control step."""
+class Bench:
+    """Worlds whose arms follow the table, and what happens in a control step."""
 
-    def __init__(self, composed: WorldModel, args: Args, device: str, joints: np.ndarray, speeds: np.ndarray) -> None:
-        arm, count = composed.arm, args.worlds
-        assert arm is not None and arm.motors is not None
-        pads = PadIndices.of(composed)
-        pairs = GelPairs([spec.gelpad for spec in composed.sensor_specs], pads.carriers, count, device=device).pairs
-        models = EnvironmentModels(composed, count)
-        self.contact = gel_contact(composed, models, pairs, num_envs=count, device=device)
-        self.engine = MujocoWarp(self.contact, pads, models, contacts=args.contacts, rows=args.rows)
+    def __init__(self, args: Args, table: np.ndarray | None = None) -> None:
+        launches, count = args.substeps + args.divided, args.worlds
+        self.world = WarpWorld(
+            scene_of(args), num_envs=count, device=args.device, launches=launches, contacts=args.contacts, rows=args.rows
+        )
+        composed = self.world.composed
         rng, qpos = np.random.default_rng(args.seed), np.repeat(composed.start[None], count, axis=0)
         first = composed.bodies["cube"].qpos
         turn = 0.5 * rng.uniform(-0.2, 0.2, count)
         qpos[:, first : first + 2] += rng.uniform(-4e-3, 4e-3, (count, 2))
         qpos[:, first + 3], qpos[:, first + 6] = np.cos(turn), np.sin(turn)
-        start = [qpos, np.repeat(composed.ctrl[None], count, axis=0)]
-        self.engine.reset(self.engine.active, *(wp.array(values, dtype=wp.float32, device=device) for values in start))
-        self.substeps, self.launches = args.substeps, args.substeps + args.divided
-        array = partial(wp.array, device=device)
-        n = len(arm)
-        known = {name: one for name, one in arm.numbers().items() if name in ("time", "joints", "speed", "bias", "mass")}
-        self.reader = self.engine.reader(known)
-        self.springs: Any = Springs()
-        for name in known:
-            setattr(self.springs, name, self.reader.arrays[name])
-        for name in ("target", "target_speed", "torque"):
-            setattr(self.springs, name, wp.zeros((count, n), dtype=wp.float64, device=device))
-        self.springs.start = wp.zeros(count, dtype=wp.float64, device=device)
-        self.springs.stiffness, self.springs.damping = FREQUENCY**2, 2.0 * FREQUENCY
-        self.motors = array(arm.motors.astype(np.int32), dtype=wp.int32)
-        self.joints, self.speeds = array(joints, dtype=wp.float64), array(speeds, dtype=wp.float64)
-        self.counts, self.counter = wp.zeros(1, dtype=wp.int32, device=device), wp.zeros(1, dtype=wp.int32, device=device)
-
-    def drive(self) -> None:
-        """Torques of the springs in the joints."""
-        self.reader.read()
-        wp.launch(joint_springs, dim=self.springs.torque.shape, inputs=[self.springs], device=self.engine.device)
-        self.engine.write_controls(self.motors, self.springs.torque)
+        self.world.reset(qpos)
+        self.world.engine.update_poses()
+        self.substeps, self.timestep = args.substeps, composed.control_timestep
+        with wp.ScopedDevice(self.world.engine.device):
+            self.table = wp.array(joint_table(self.world) if table is None else table, dtype=wp.float64)
+            self.counts, self.counter = wp.zeros(1, dtype=wp.int32), wp.zeros(1, dtype=wp.int32)
 
     def control_step(self) -> None:
         """One control step of all worlds."""
-        engine, contact, device = self.engine, self.contact, self.engine.device
-        count = engine.num_envs
-        self.reader.read()
-        tables = [self.joints, self.speeds, PRESS, self.counter, self.springs.time]
-        wp.launch(next_targets, dim=self.springs.target.shape, inputs=[*tables, self.springs], device=device)
-        engine.advance(self.drive, scene_steps=self.substeps, launches=self.launches)
-        pressed = [contact.wrenches, LEAST_FORCE, self.counts]
-        wp.launch(count_pressed, dim=count, inputs=pressed, device=device)
-        wp.launch(count_step, dim=1, inputs=[self.counter], device=device)
+        world, device = self.world, self.world.engine.device
+        tables = [self.table, PRESS, self.timestep, self.counter, world.target, world.target_speed]
+        wp.launch(next_targets, dim=world.target.shape, inputs=tables, device=device)
+        world.launch()
+        pressed = [world.contact.wrenches, LEAST_FORCE, self.counts, self.counter]
+        wp.launch(count_pressed, dim=world.engine.num_envs, inputs=pressed, device=device)
 
     def split(self, steps: int) -> dict[str, float]:
-        """Milliseconds of a control step's parts, each waited for, so that they add up to more than a step."""
-        engine, contact = self.engine, self.contact
+        """Milliseconds of a control step's parts without divided steps, each waited for, so that they add up to more than a step."""
+        engine, contact = self.world.engine, self.world.contact
 
         def find() -> None:
             engine.choose()
@@ -279,7 +216,7 @@ class Worlds:
 
         parts: dict[str, Callable[[], None]] = {
             "begin_step": engine.begin_step,
-            "drive": self.drive,
+            "drive": self.world.drive,
             "free_acceleration": engine.free_acceleration,
             "find_contacts": find,
             "put_contacts": engine.put_contacts,
@@ -287,10 +224,10 @@ class Worlds:
             "read_rows": engine.read_rows,
             "shear": contact.end,
         }
-        recorded_parts = {name: engine.capture(part) for name, part in parts.items()}
+        graphs = {name: engine.capture(part) for name, part in parts.items()}
         spent = dict.fromkeys(parts, 0.0)
         for _ in range(steps * self.substeps):
-            for name, part in recorded_parts.items():
+            for name, part in graphs.items():
                 wp.synchronize_device(engine.device)
                 begin = time.perf_counter()
                 part()

@@ -46,6 +46,7 @@ PLACES: dict[str, tuple[str, ...]] = {
     ),
     "solver": (
         "ipc",
+        "experiments/test_bench_gpu.py",
         "markers/test_other_models.py",
         "physics/rigid/test_pad_search.py",
         "physics/rigid/test_step_kernels.py",
@@ -57,6 +58,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "regression",
         "test_sensor_soft.py",
         "test_warp_runtime.py",
+        "world/engine",
         "world/test_held.py",
         "world/test_mujoco_rows.py",
         "world/test_pad_shear.py",

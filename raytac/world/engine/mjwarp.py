@@ -34,7 +34,8 @@ _TOLERANCE = 1e-8
 """Of the solver, over the trace of the mass matrix. With MuJoCo Warp's own 1e-6 it stops before the forces on a cube of 50 g that an arm
 pushes are in balance."""
 _VARIED = (
-    "body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0", "body_pos", "body_quat", "geom_friction",
+    "body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invweight0", "actuator_acc0", "body_pos",
+    "body_quat", "geom_friction",
 )  # fmt: skip
 """What a variation changes in MuJoCo's model, with what follows from it."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from copy import copy
 from functools import cache
@@ -15,8 +16,9 @@ import warp as wp
 from raytac import PadStepper, mount
 from raytac.errors import InputError
 from raytac.robots.frames import body_poses, site_poses
+from raytac.specs import load_task
 from raytac.world.compose import compose
-from raytac.world.environment_models import EnvironmentModels
+from raytac.world.environment_models import EnvironmentModels, Variation
 from raytac.world.gel_pairs import GelPairs
 from raytac.world.pad_contact import PadIndices, gel_contact
 from raytac.world.world_model import WorldModel, own_world_model
@@ -28,16 +30,16 @@ from raytac.world.engine.mjwarp import MujocoWarp  # noqa: E402
 G, RADIUS = 9.81, 5e-3
 MASSES = 0.05, 0.02
 TOUCHES = {"ball": 0.3}
-CUDA = pytest.param("cuda", marks=pytest.mark.gpu)
 
 
 @cache
-def ball_on_pad(mass: float = MASSES[0], timestep: float = 1e-3) -> mujoco.MjModel:
+def ball_on_pad(mass: float = MASSES[0], timestep: float = 1e-3, jacobian: str = "dense") -> mujoco.MjModel:
     """A pad that lies on its back, and a ball on the middle of it."""
     spec = mujoco.MjSpec()
     option = spec.option
     option.timestep, option.impratio, option.tolerance = timestep, 10.0, 1e-10
     option.cone, option.integrator = mujoco.mjtCone.mjCONE_ELLIPTIC, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{jacobian.upper()}")
     mount(spec, "gelsight_mini", body="world", name="pad", pose=np.eye(4))
     ball = spec.worldbody.add_body(name="ball", pos=(0.0, 0.0, RADIUS - 1e-4))
     ball.add_freejoint()
@@ -72,8 +74,16 @@ class Warped:
         self.data, self.step = self.engine.data, self.engine.advance
 
     @classmethod
-    def balls(cls, masses: Sequence[float] = MASSES, device: str = "cpu", *, timestep: float = 1e-3, **options: Any) -> Warped:
-        models = [ball_on_pad(mass, timestep) for mass in masses]
+    def balls(
+        cls,
+        masses: Sequence[float] = MASSES,
+        device: str = "cpu",
+        *,
+        timestep: float = 1e-3,
+        jacobian: str = "dense",
+        **options: Any,
+    ) -> Warped:
+        models = [ball_on_pad(mass, timestep, jacobian) for mass in masses]
         return cls(models, own_world_model(models[0], touches=TOUCHES), device, **options)
 
     def reset(self, chosen: wp.array) -> None:
@@ -107,10 +117,17 @@ def drag(step: int, mass: float) -> np.ndarray:
     return force
 
 
-@pytest.mark.parametrize("device", ["cpu", CUDA])
-def test_balls_that_are_pressed_and_dragged_move_as_in_c_mujoco(device: str) -> None:
+@pytest.mark.parametrize(
+    ("device", "jacobian"),
+    [
+        ("cpu", "dense"),
+        pytest.param("cpu", "sparse", marks=pytest.mark.slow),
+        pytest.param("cuda", "dense", marks=pytest.mark.gpu),
+    ],
+)
+def test_balls_that_are_pressed_and_dragged_move_as_in_c_mujoco(device: str, jacobian: str) -> None:
     """Two masses; the gel sticks, slips and sticks again."""
-    warped, slides, touched = Warped.balls(device=device), 0, 0
+    warped, slides, touched = Warped.balls(device=device, jacobian=jacobian), 0, 0
     worlds = [(model, mujoco.MjData(model), PadStepper(model, touches=TOUCHES)) for model in map(ball_on_pad, MASSES)]
     for step in range(120):
         forces = np.array([drag(step, mass) for mass in MASSES])
@@ -254,8 +271,6 @@ def test_an_option_with_which_pads_cannot_act_is_refused() -> None:
 
 @pytest.mark.parametrize("task", ["push_cube", "balance_pole", "lift_cube", "roll_ball"])
 def test_models_of_the_tasks_are_taken(task: str) -> None:
-    from raytac.specs import load_task
-
     composed = compose(load_task(task), "rigid")
     engine = Warped([composed.model] * 2, composed).engine
     assert engine.data.qpos.shape == (2, composed.model.nq) and engine.model.nmaxcondim == 6
@@ -269,6 +284,33 @@ def test_models_of_the_tasks_are_taken(task: str) -> None:
     for found, body in zip(bodies[1], composed.touched, strict=True):
         np.testing.assert_allclose(found, body_poses([state], body.index)[0], atol=1e-6)
     assert not engine.invalid().any()
+
+
+@pytest.mark.parametrize(("task", "body"), [("push_cube", "cube"), ("lift_cube", "object")])
+def test_a_variation_reaches_all_that_mujoco_derives_from_it(task: str, body: str) -> None:
+    composed = compose(load_task(task), "rigid")
+    models, pads = EnvironmentModels(composed, 2), PadIndices.of(composed)
+    contact = gel_contact(composed, models, [], num_envs=2)
+    engine = MujocoWarp(contact, pads, models)
+    sensor, shift = composed.sensors[0].name, np.eye(4)
+    shift[:3, 3] = 1e-3, -2e-3, 0.5e-3
+    factors = {body: np.array([1.7])}
+    models.vary([1], Variation(mass=factors, friction=factors, mounting={sensor: shift[None]}))
+    engine.prepare()
+    fields = [f.name for f in dataclasses.fields(engine.model) if isinstance(getattr(engine.model, f.name), wp.array)]
+    shared = [name for name in fields if isinstance(getattr(models[0], name, None), np.ndarray)]
+    assert {"body_mass", "geom_friction", "body_pos", "dof_invweight0"} <= set(shared)
+    for name in shared:
+        one, two = (np.asarray(getattr(models[b], name), np.float32).ravel() for b in range(2))
+        if not np.array_equal(one, two):
+            found = getattr(engine.model, name).numpy().reshape(2, -1)
+            np.testing.assert_array_equal(found, [one, two], err_msg=name)
+    engine.reset(engine.active, *(wp.array(np.stack([v, v]), dtype=wp.float32) for v in (composed.start, composed.ctrl)))
+    engine.update_poses()
+    state = mujoco.MjData(models[1])
+    composed.reset(models[1], state)
+    mujoco.mj_kinematics(models[1], state)
+    np.testing.assert_allclose(engine.read_poses()[0][1, 0], site_poses([state], int(pads.sites[0]))[0], atol=1e-6)
 
 
 @pytest.mark.gpu
