@@ -149,7 +149,8 @@ class Training:
         self._start = time.perf_counter()
         self.device = "cuda" if args.device == "auto" and torch.cuda.is_available() else args.device.replace("auto", "cpu")
         self.settings = _settings(args, touch, seed)
-        self.steps, self.iteration = 0, 0
+        saved = self._saved()  # before any process is started
+        self.steps, self.iteration = (0, 0) if saved is None else (saved["steps"], saved["iteration"])
         tactile: Any = {"none": None, "task": "task"}.get(touch, tuple(touch.split("+")))
         self.env = RslVecEnv(
             getattr(raytac.envs, f"{args.task}VectorEnv"),
@@ -175,8 +176,11 @@ class Training:
             desired_kl=args.desired_kl, device=self.device,
         )  # fmt: skip
         self.ppo.train_mode()
-        if (folder / "checkpoint.pt").exists():
-            self._load()
+        if saved is not None:
+            self._start -= saved["wall_s"]
+            self.ppo.load(saved, None, True)
+            for name in ("progress.csv", "evaluation.csv"):
+                _keep_rows(folder / name, self.steps)
         self._writer: Any = None
         with contextlib.suppress(ImportError):  # not installed: the CSV files hold all that it would show
             from torch.utils.tensorboard import SummaryWriter
@@ -271,11 +275,13 @@ class Training:
             torch.save({**progress, **values}, stream)
             write_atomic(self.folder / f"{name}.pt", stream.getvalue())
 
-    def _load(self) -> None:
+    def _saved(self) -> dict[str, Any] | None:
         path = self.folder / "checkpoint.pt"
+        if not path.exists():
+            return None
         try:
             saved = torch.load(path, map_location=self.device, weights_only=True)
-            settings, self.steps, self.iteration, spent = (saved[k] for k in ("settings", "steps", "iteration", "wall_s"))
+            settings, *_ = (saved[name] for name in ("settings", "steps", "iteration", "wall_s", "actor_state_dict"))
         except Exception as error:
             raise InputError("out", value=path, rule=f"must be a checkpoint of train_gpu ({error})") from error
         if settings != self.settings:
@@ -283,10 +289,7 @@ class Training:
             raise InputError(
                 "out", value=self.folder, rule=f"holds a training of other settings, with {other}: name another folder"
             )
-        self._start -= spent
-        self.ppo.load(saved, None, True)
-        for name in ("progress.csv", "evaluation.csv"):
-            _keep_rows(self.folder / name, self.steps)
+        return saved
 
     @property
     def wall_s(self) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.shared_memory import SharedMemory
@@ -44,13 +44,32 @@ class FlatVector:
             are written.
     """
 
-    def __init__(self, kind: type[TactileVectorEnv], num_envs: int, *, history: int = 1, seed: int = 0, **options: Any) -> None:
-        """Make the vector. ``seed``: of environment 0. ``options``: of ``TaskBatch``; ``body_seen`` is whether the actor sees it."""
+    def __init__(
+        self,
+        kind: type[TactileVectorEnv],
+        num_envs: int,
+        *,
+        history: int = 1,
+        hidden: Sequence[str] = (),
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
+        """Make the vector.
+
+        Args:
+            kind: the task's vector, such as ``PushCubeVectorEnv``.
+            num_envs: number of environments B.
+            history: number of steps whose observations the actor is given.
+            hidden: modalities that neither is given, though ``tactile`` names them: for pictures.
+            seed: of environment 0; environment b has seed + b.
+            options: of ``kind``; ``body_seen`` is whether the actor sees the body.
+        """
         seen = options.pop("body_seen", None)
         body_seen = kind.task.body_seen if seen is None else bool(seen)
         self.env = kind(num_envs, seed=seed, body_seen=True, **options)
         batch = self.env.batch
-        self._names = [name for name in batch.arrays if name != "body" or body_seen]
+        unseen = tuple(f"_{modality}" for modality in hidden)
+        self._names = [name for name in batch.arrays if (name != "body" or body_seen) and not name.endswith(unseen)]
         self._sensors = tuple(batch.world.sensor_names)
         now = sum(int(np.prod(batch.arrays[name].shape)) for name in self._names)
         self._past = np.zeros((num_envs, check_whole("history", history), now), np.float32)

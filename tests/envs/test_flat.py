@@ -55,6 +55,13 @@ def test_history_is_newest_first_and_does_not_reach_into_the_episode_before() ->
     assert many.buffers["truncated"].tolist() == [1.0, 0.0] and many.buffers["age"].tolist() == [0.0, 2.0]
 
 
+@pytest.mark.renderer
+def test_what_is_hidden_is_for_pictures_alone() -> None:
+    options = {"tactile": ("markers", "wrench"), "max_episode_steps": 3}
+    all_seen, some = FlatVector(RollBallVectorEnv, 1, **options), FlatVector(RollBallVectorEnv, 1, hidden=("markers",), **options)
+    assert all_seen.layout.fields["actor"] == (15 + 6 + 198,) and some.layout.fields["actor"] == (15 + 6,)
+
+
 def test_actions_are_cut_to_the_range_and_must_be_finite() -> None:
     many = FlatVector(RollBallVectorEnv, 2, tactile=None)
     many.reset(0)

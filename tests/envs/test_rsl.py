@@ -15,7 +15,8 @@ pytest.importorskip("rsl_rl.algorithms", exc_type=ImportError)
 
 import torch
 
-from experiments import train_gpu
+from experiments import play, train_gpu
+from experiments.flat_policy import FlatPolicy
 from raytac.envs import RollBallVectorEnv
 from raytac.envs.rsl import RslVecEnv
 from raytac.errors import InputError
@@ -77,6 +78,10 @@ def test_a_training_that_was_cut_ends_as_one_that_was_not(tmp_path: Path) -> Non
             assert torch.equal(tensor, two[name][key]), key
     first = torch.load(tmp_path / "cut/wrench/seed0/policy.pt", weights_only=True)
     assert (tmp_path / "cut/wrench/seed0/policy.pt").stat().st_size < 2e6 and first["settings"]["history"] == 3
+    rated = play.main(
+        play.Args(policy=str(tmp_path / "cut/wrench/seed0/policy.pt"), episodes=3, film=False, out=tmp_path / "played")
+    )
+    assert rated["task"] == "RollBall" and rated["episodes"] == 3 and float(rated["length"]) > 1  # type: ignore[arg-type]
     with pytest.raises(InputError, match="'hidden': 8"):
         train_gpu.main(replace(cut, hidden=9))
 
@@ -92,6 +97,26 @@ def test_metrics_are_of_the_worst_seed_of_the_first_touch(tmp_path: Path, monkey
     assert read_metrics(tmp_path / "metrics.json") == found
     rows = (tmp_path / "none/seed0/evaluation.csv").read_text().splitlines()
     assert len(rows) == 2 and rows[1].startswith("16,")
+
+
+def test_a_policy_does_what_it_did_in_training(tmp_path: Path) -> None:
+    train_gpu.main(replace(SMALL, steps=16, touch="none", out=tmp_path))
+    policy = FlatPolicy(tmp_path / "none/seed0/policy.pt")
+    training = train_gpu.Training(replace(SMALL, out=tmp_path), "none", 0, tmp_path / "none/seed0")
+    played = policy.vector(4)
+    seen = training.env.reset(5)
+    played.reset(5)
+    for _ in range(3):
+        actions = training.ppo.get_policy()(seen).detach()
+        np.testing.assert_allclose(policy(played.buffers["actor"]), actions, atol=1e-6)
+        played.buffers["action"][:] = actions
+        played.step()
+        seen, *_ = training.env.step(actions)
+    training.close()
+    (tmp_path / "other.pt").write_bytes(b"no policy")
+    assert not FlatPolicy.is_one(tmp_path / "other.pt")
+    with pytest.raises(InputError, match="policy of train_gpu"):
+        FlatPolicy(tmp_path / "other.pt")
 
 
 @pytest.mark.parametrize(
