@@ -179,6 +179,8 @@ class TactileWorld:
             others = np.setdiff1d(np.arange(self.model.nu), self.arm.motors)
             self._holding = self._law.springs(self.data, others.tolist())
             self._holding.aim(self.composed.start[self.arm.qpos], np.zeros(1), np.zeros(1), self.composed.ctrl[others])
+        self._spares: list[mujoco.MjData] = []
+        """States in which a reset keeps those that it may have to put back."""
         self._failed, self._stepped = np.zeros(num_envs, bool), Lock()
         self._start_over(range(num_envs))
         self._pads: WorldPads = WORLD_PADS.config_class(name)(
@@ -278,7 +280,12 @@ class TactileWorld:
         self, envs: Sequence[int], joints: np.ndarray | None, bodies: Mapping[str, np.ndarray], variation: Variation | None
     ) -> None:
         """Reset to given starts or models; nothing changes if bodies overlap there."""
-        before, failed, models = [copy(self.data[b]) for b in envs], self._failed.copy(), self.models.snapshot()
+        failed, models = self._failed.copy(), self.models.snapshot()
+        # A state takes longer to make than to copy.
+        self._spares += [mujoco.MjData(self.model) for _ in range(len(envs) - len(self._spares))]
+        before = self._spares[: len(envs)]
+        for b, spare in zip(envs, before, strict=True):
+            mujoco.mj_copyData(spare, self.model, self.data[b])
         if variation is not None:
             self.models.vary(envs, variation)
         self._start_over(envs, joints, bodies)

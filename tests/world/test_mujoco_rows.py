@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from raytac.errors import BackendError
+from raytac.robots import mujoco_memory
 from raytac.robots.frames import body_poses, site_poses
 from raytac.specs import BodySpec, RobotSpec, TaskScene, load_task
-from raytac.world.engine import mujoco_memory
 from raytac.world.engine.c_mujoco import CMujoco
 from raytac.world.hard_contacts import is_hard
 from raytac.world.pad_contact import PadIndices

@@ -36,21 +36,29 @@ _INF = wp.constant(wp.float64(float("inf")))
 
 @wp.func
 def lines_below(shapes: Shapes, pads: Pads, pad: wp.int32, body: wp.int32, pose: wp.mat44d) -> wp.vec4i:
-    """Lines of the pad on which parts of a body may be lower than the bonded face: x from, to, y from, to.
+    """Lines of the pad on which parts of a body may be lower than the bonded face: x from, to, y from, to. None if it all lies behind.
 
     Without the outermost lines: MuJoCo lets bodies some hundredths of a millimetre into walls, and a case may be as wide as its gel.
     """
     low_x, high_x, low_y, high_y = infinity(), -infinity(), infinity(), -infinity()
-    turn, origin = turn_of(pose), place_of(pose)
+    turn, origin, highest = turn_of(pose), place_of(pose), -infinity()
     for part in range(shapes.first_part[body], shapes.first_part[body + 1]):
         rotation, at = turn * shapes.rotation[part], turn * shapes.offset[part] + origin
         if shapes.kind[part] == _PLANE:
-            low_x, high_x, low_y, high_y = -infinity(), infinity(), -infinity(), infinity()
+            highest = infinity()
+            n = wp.vec3d(rotation[0, 2], rotation[1, 2], rotation[2, 2])
+            across = wp.abs(n[0]) * pads.half[pad][0] + wp.abs(n[1]) * pads.half[pad][1]
+            # Only one that looks down has an underside.
+            if n[2] < _0 and at[2] + (n[0] * at[0] + n[1] * at[1] + across) / n[2] < _SLACK - pads.thickness[pad]:
+                low_x, high_x, low_y, high_y = -infinity(), infinity(), -infinity(), infinity()
         else:
             centre, half = rotation * shapes.centre[part] + at, part_box(shapes, part, rotation, at)
+            highest = wp.max(highest, centre[2] + half[2] + _SLACK)
             if centre[2] - half[2] - _SLACK < -pads.thickness[pad]:
                 low_x, high_x = wp.min(low_x, centre[0] - half[0] - _SLACK), wp.max(high_x, centre[0] + half[0] + _SLACK)
                 low_y, high_y = wp.min(low_y, centre[1] - half[1] - _SLACK), wp.max(high_y, centre[1] + half[1] + _SLACK)
+    if highest <= -_2 * pads.thickness[pad]:
+        return wp.vec4i(0, 0, 0, 0)
     columns = nodes_within(pads.first_x[pad, _LAST], pads.nx[pad, _LAST], low_x, high_x, pads)
     rows = nodes_within(pads.first_y[pad, _LAST], pads.ny[pad, _LAST], low_y, high_y, pads)
     return wp.vec4i(

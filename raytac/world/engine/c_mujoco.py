@@ -17,6 +17,7 @@ import warp as wp
 from raytac.errors import InputError
 from raytac.physics.rigid.gel_contact import GelContact, HostViews
 from raytac.physics.rigid.world_kernels import ROWS
+from raytac.robots.mujoco_memory import checked_layouts, same_states
 from raytac.robots.states import StateReader, body_pose, site_pose
 from raytac.warp_runtime import Recorded
 from raytac.world.engine.c_kernels import (
@@ -28,7 +29,6 @@ from raytac.world.engine.c_kernels import (
     write_references,
     write_regularisation,
 )
-from raytac.world.engine.mujoco_memory import checked_layouts
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.implicit_damping import ImplicitDamping
 from raytac.world.pad_contact import PadIndices
@@ -106,7 +106,7 @@ class CMujoco:
 
     def bind(self, datas: Sequence[mujoco.MjData]) -> None:
         """Name the states that the next calls work on."""
-        if not _same(datas, self._datas):
+        if not same_states(datas, self._datas):
             self._datas = list(datas)
             self._address[:] = [data._address for data in datas]
             self._poses = None
@@ -118,7 +118,7 @@ class CMujoco:
             InputError: a model has another timestep than at first, or a cone in which pads cannot act.
         """
         models = [self._models_now[b] for b in range(len(self._datas))]
-        if not _same(models, self._models):
+        if not same_states(models, self._models):
             self._models = models
             self._options = [model.opt for model in models]
         self._sparse[0] = mujoco.mj_isSparse(models[0])
@@ -247,10 +247,6 @@ def _last_dof(model: mujoco.MjModel, body: int) -> int:
     while body and not model.body_dofnum[body]:
         body = int(model.body_parentid[body])
     return int(model.body_dofadr[body] + model.body_dofnum[body]) - 1 if body else -1
-
-
-def _same(one: Sequence[Any], other: Sequence[Any]) -> bool:
-    return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
 
 
 def _array(values: np.ndarray) -> wp.array:
