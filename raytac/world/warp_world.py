@@ -119,7 +119,7 @@ class WarpWorld:
             self._graph()
 
     def launch(self) -> None:
-        """What ``step`` records: for a graph that does more."""
+        """Launch a control step, as ``step`` records it: for a graph that does more."""
         self._reader.read()
         wp.copy(self._springs.start, self._reader.arrays["time"])
         self.engine.advance(self.drive, scene_steps=self._steps, launches=self._launches)
