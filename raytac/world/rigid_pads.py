@@ -34,7 +34,6 @@ from raytac.warp_runtime import Recorded
 from raytac.world.engine.base import Engine
 from raytac.world.engine.c_mujoco import CMujoco
 from raytac.world.environment_models import EnvironmentModels
-from raytac.world.forbidden_overlap import BondedFaces
 from raytac.world.gel_pairs import GelPairs
 from raytac.world.pad_contact import PadIndices, gel_contact
 from raytac.world.pad_surfaces import PadSurfaces
@@ -68,7 +67,6 @@ class RigidPads:
         self.bodies = composed.touched
         self._names = [mounted.name for mounted in composed.sensors]
         gels, shapes = [spec.gelpad for spec in composed.sensor_specs], [body.parts for body in self.bodies]
-        self._faces = BondedFaces(gels, shapes)
         self._views = HostViews(contact)
         self._begin = [Recorded(engine.read_frames, partial(contact.begin, whole=whole)) for whole in (False, True)]
         self._move = Recorded(engine.read_frames, contact.move)
@@ -83,7 +81,7 @@ class RigidPads:
         Raises:
             OverlapError: a body starts beyond a pad's bonded face.
         """
-        pierced = self._faces.pierced(self._pad_from_body()[np.asarray(envs, int)])
+        pierced = self.contact.faces.pierced(self._pad_from_body()[np.asarray(envs, int)])
         for row, pad, i in np.argwhere(pierced).tolist():
             rule = f"{self.bodies[i].name!r} starts beyond the face that the gel of {self._names[pad]!r} is bonded to"
             raise OverlapError(f"environment {envs[row]}: {rule}")
@@ -112,7 +110,6 @@ class RigidPads:
             self.contact.choose(sound, 0)
             self.engine.update_poses()  # so that they are those of the end of the step
             self._move()
-            self._mark_pierced(sound)
             self._mark_lost(sound, failed)
 
     def _step(self, envs: np.ndarray, drive: Drive, done: np.ndarray, failed: np.ndarray) -> np.ndarray:
@@ -120,7 +117,7 @@ class RigidPads:
         self.contact.choose(envs, done)
         self.engine.begin_step()
         drive(envs)
-        self._insert(envs)
+        self._insert()
         self.engine.end_step()
         self._end()
         self._mark_lost(envs, failed)
@@ -136,7 +133,7 @@ class RigidPads:
         envs = np.flatnonzero(~failed)
         self.contact.choose(envs, 0)
         if len(envs):
-            self._insert(envs, whole=True)
+            self._insert(whole=True)
             self._mark_lost(envs, failed)
         return envs
 
@@ -147,20 +144,11 @@ class RigidPads:
             self._end()
             self._mark_lost(envs, failed)
 
-    def _insert(self, envs: np.ndarray, *, whole: bool = False) -> None:
+    def _insert(self, *, whole: bool = False) -> None:
         """Put the pads' contacts among MuJoCo's, with the controls of the step; ``whole``: it is not divided."""
         self.engine.free_acceleration()
         self._begin[whole]()
-        self._mark_pierced(envs)
         self.engine.put_contacts(own_step=not whole)
-
-    def _mark_pierced(self, envs: np.ndarray) -> None:
-        """Mark environments as lost in which a body is beyond a bonded face, or was on its path since the last step."""
-        views, count = self._views, len(envs)
-        suspects = views.suspect[:count]
-        if np.count_nonzero(suspects):
-            pierced = self._faces.pierced_on_path(views.poses[:count], views.poses_before[:count], suspects != 0)
-            views.lost[:count][pierced.any(axis=(1, 2))] = 1
 
     def _mark_lost(self, envs: np.ndarray, failed: np.ndarray) -> None:
         """Mark environments that broke down in ``failed`` (B,)."""
@@ -178,7 +166,7 @@ class RigidPads:
         contacts = self.contact.search.contacts(poses, np.zeros(1, int), 0.0)
         depth = np.zeros(poses.shape[1:3])
         depth[contacts.pad, contacts.body] = contacts.depth
-        depth[self._faces.pierced(poses)[0]] = np.inf
+        depth[self.contact.faces.pierced(poses)[0]] = np.inf
         return [(self._names[k], self.bodies[i].name, float(depth[k, i])) for k, i in np.argwhere(depth > 0.0).tolist()]
 
     def reading(self, name: str, grid: PadGrid, failed: np.ndarray, envs: Sequence[int] | None = None) -> PadReading:

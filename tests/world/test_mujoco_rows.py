@@ -43,7 +43,7 @@ def half_a_step(world: TactileWorld) -> RigidPads:
     pads.engine.prepare()
     pads.contact.choose(envs, 0)
     pads.engine.begin_step()
-    pads._insert(envs)
+    pads._insert()
     return pads
 
 

@@ -14,6 +14,7 @@ from raytac.physics.rigid import world_kernels as world
 from raytac.physics.rigid.env_kernels import choose_active, clear_environments
 from raytac.physics.rigid.load_law import shear_modulus
 from raytac.physics.rigid.motion_kernels import Frames, move_bodies, pair_of_gels
+from raytac.physics.rigid.pierced import BondedFaces
 from raytac.physics.rigid.row_kernels import read_rows, set_rows, sum_wrenches
 from raytac.physics.rigid.search import PadSearch
 from raytac.physics.rigid.shear_state import ShearState
@@ -64,6 +65,7 @@ class GelContact:
         rolling: torque of rolling over its bound, about the pad's tangents (B, pads, bodies + pads).
         acceleration: at which contacts closed faster in their last step [m/s²], (B, pads, bodies + pads).
         shear: of the gels.
+        faces: beyond which no body may be.
         chosen: environments of this step, as ``choose`` named them.
     """
 
@@ -124,6 +126,7 @@ class GelContact:
         # On the CPU the host writes through views, at no cost; on CUDA it copies.
         self._envs, self._done = self.steps.envs.numpy(), self.steps.done.numpy()
         self._cleared = wp.zeros(num_envs, dtype=wp.bool, device=self.device)
+        self.faces = BondedFaces(*self.search.geometry, self.device)
         self._clock, self._case_travel = [float(timestep), self.ticks], float(case_travel)
         self._pairs = [(search, i, count + j) for i, j, search in pairs]
         self._searches = [*([(self.search, 0, 0)] if self.search.pairs else []), *self._pairs]
@@ -135,7 +138,7 @@ class GelContact:
 
         ``whole``: of the scene's step, which is not divided.
         """
-        self.move()
+        self._move_bodies()
         for search, pad, body in self._pairs:
             poses = [self.motion, self.steps, pad, body, *self._clock, search.poses, search.reach]
             self._launch(pair_of_gels, (), poses)
@@ -156,9 +159,14 @@ class GelContact:
                 search.poses.shape[1:],
                 [*results, *shared, self.rolling, self.steps, self.shear.struct, self.slots],
             )
+        self.faces.lose(self.motion, self.steps)
 
     def move(self) -> None:
-        """Motion of bodies alone, with what may have gone through a pad."""
+        """Motion of bodies alone; environments in which a body has gone through a pad are lost."""
+        self._move_bodies()
+        self.faces.lose(self.motion, self.steps)
+
+    def _move_bodies(self) -> None:
         inputs = [self.frames, self.steps, self._gels, self._touched, self.before, *self._clock, self._case_travel]
         self._launch(
             move_bodies, (len(self._gels.thickness),), [*inputs, self.motion, self.slots, self.search.poses, self.search.reach]
