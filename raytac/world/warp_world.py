@@ -28,7 +28,7 @@ class WarpWorld:
     """B environments of a task scene, whose arms follow joint targets by springs of the law of ``JointImpedance``.
 
     A control step is launched without waiting for the device, on CUDA as one graph. Sensors, and controllers of another kind, need
-    ``TactileWorld``. A body that goes through a gel ends its environment; one that gets behind a bonded face in one step is not noticed.
+    ``TactileWorld``. An environment in which a body goes through a pad is no longer active.
 
     Attributes:
         composed: names and indices of the scene's parts in the model.
