@@ -219,6 +219,7 @@ class Bench:
             "drive": self.world.drive,
             "free_acceleration": engine.free_acceleration,
             "find_contacts": find,
+            "search": contact.search.launch,  # once more: it is in ``find_contacts``
             "put_contacts": engine.put_contacts,
             "end_step": engine.end_step,
             "read_rows": engine.read_rows,

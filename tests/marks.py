@@ -46,7 +46,6 @@ PLACES: dict[str, tuple[str, ...]] = {
     ),
     "solver": (
         "ipc",
-        "experiments/test_bench_gpu.py",
         "markers/test_other_models.py",
         "physics/rigid/test_pad_search.py",
         "physics/rigid/test_step_kernels.py",

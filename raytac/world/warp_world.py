@@ -28,7 +28,7 @@ class WarpWorld:
     """B environments of a task scene, whose arms follow joint targets by springs of the law of ``JointImpedance``.
 
     A control step is launched without waiting for the device, on CUDA as one graph. Sensors, and controllers of another kind, need
-    ``TactileWorld``. A body that goes through a gel ends its environment; one that gets behind a bonded face in one step is not noticed.
+    ``TactileWorld``. An environment in which a body goes through a pad is no longer active.
 
     Attributes:
         composed: names and indices of the scene's parts in the model.
@@ -119,7 +119,7 @@ class WarpWorld:
             self._graph()
 
     def launch(self) -> None:
-        """What ``step`` records: for a graph that does more."""
+        """Launch a control step, as ``step`` records it: for a graph that does more."""
         self._reader.read()
         wp.copy(self._springs.start, self._reader.arrays["time"])
         self.engine.advance(self.drive, scene_steps=self._steps, launches=self._launches)

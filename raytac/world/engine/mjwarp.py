@@ -31,13 +31,13 @@ from raytac.world.world_state import LARGEST_SPEED
 _SLIDES = 2
 """Solves for the lift of a slide that begins or ends, before that of the step."""
 _TOLERANCE = 1e-8
-"""Of the solver, over the trace of the mass matrix. With MuJoCo Warp's own 1e-6 it stops before the forces on a cube of 50 g that an arm
-pushes are in balance."""
+"""Gain of an iteration, over the trace of the mass matrix, at which the solver stops. An arm makes that trace large, so that MuJoCo Warp's
+own 1e-6 is coarse for a light body beside it."""
 _VARIED = (
     "body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invweight0", "actuator_acc0", "body_pos",
     "body_quat", "geom_friction",
 )  # fmt: skip
-"""What a variation changes in MuJoCo's model, with what follows from it."""
+"""Members of MuJoCo's model that a variation changes, with those that MuJoCo derives from them."""
 
 
 class MujocoWarp:

@@ -244,6 +244,16 @@ def test_a_reset_of_some_worlds_leaves_the_others_to_the_bit() -> None:
     np.testing.assert_array_equal(one.wrench(), [other.wrench()[0], fresh.wrench()[1]])
 
 
+def test_a_body_beyond_a_bonded_face_ends_its_world() -> None:
+    warped = Warped.balls()
+    warped.lift(1, -4e-3)
+    before = warped.state()
+    warped.step()
+    assert warped.engine.active.numpy().tolist() == [True, False]
+    np.testing.assert_array_equal(warped.state()[1], before[1])
+    assert warped.wrench()[0].any() and not warped.wrench()[1].any()
+
+
 @pytest.mark.parametrize(("options", "name"), [({"contacts": 0, "rows": 64}, "contacts"), ({"rows": 5}, "rows")])
 def test_memory_that_is_too_small_is_an_error_that_names_the_number(options: dict[str, Any], name: str) -> None:
     warped = Warped.balls(**options)
