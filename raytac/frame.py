@@ -128,7 +128,7 @@ class TactileFrame:
         """The same with other values of some fields; None leaves one out."""
         if values.keys() & IMAGES:
             self._wait()
-        own = {"images" if name == "_images" else name: value for name, value in self.__dict__.items()}
+        own = {"images" if name == "_images" else name: value for name, value in self.__dict__.copy().items()}
         return TactileFrame(**{**own, **values})
 
     def _wait(self) -> None:
@@ -151,9 +151,10 @@ class TactileFrame:
         def __getattr__(self, name: str) -> Any:
             if name not in type(self).__dataclass_fields__:
                 raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-            if name in IMAGES and "_images" in self.__dict__:
+            if name in IMAGES:
                 self._wait()
-                return getattr(self, name)
+                if name in self.__dict__:  # another thread may have waited since the lookup that failed
+                    return self.__dict__[name]
             raise MissingOutputError(f"frame.{name}", rule=_ASK.get(name, f'was not asked for: outputs=("{name}", …)'))
 
     def __repr__(self) -> str:

@@ -226,3 +226,12 @@ def test_images_wait_until_they_are_read() -> None:
     assert sensor.press("sphere").with_values(rgb=black).rgb is black
     with pytest.raises(MissingOutputError, match="normals"):
         _ = sensor.press("sphere").normals
+
+
+def test_a_lookup_that_another_thread_overtakes_finds_the_image() -> None:
+    rgb = np.zeros((1, 2, 2, 3), np.uint8)
+    frame = TactileFrame(make_surface(), images=lambda: {"rgb": rgb, "depth": None})
+    assert "rgb" in frame.outputs  # waits, as another thread does between a failed lookup and __getattr__
+    assert TactileFrame.__dict__["__getattr__"](frame, "rgb") is rgb
+    with pytest.raises(MissingOutputError, match="depth"):
+        _ = frame.depth

@@ -204,11 +204,15 @@ class DeviceMode(ABC):
 
         Dr.Jit computes them beside what the caller does next. At most one call is under way: the next one waits for it. Dr.Jit lets
         only the thread that launched a kernel wait for it, so in another thread the function renders the surface again.
+        The arrays of ``surface`` may be written to at once: the images are those of its values at the call.
 
         Raises the same as ``render``.
         """
         if self._is_running:
             dr.sync_thread()
+        # Copies: on the CPU Dr.Jit reads NumPy memory in place, when the kernel runs.
+        ink = None if surface.ink is None else surface.ink.copy()
+        surface = replace(surface, height=surface.height.copy(), contact=surface.contact.copy(), ink=ink)
         heights, failed = self._checked(surface)
         pressed = self._pressed(surface, heights, failed)
         whole = len(pressed) == surface.batch

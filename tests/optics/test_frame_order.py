@@ -364,3 +364,21 @@ def test_another_thread_reads_the_same_images(mode: str) -> None:
     assert len(read) == 5
     for images in read:
         assert_same(images, expected, "read in another thread")
+
+
+@EACH_MODE
+@pytest.mark.parametrize("in_thread", [False, True])
+def test_arrays_may_be_written_to_before_the_images_are_read(mode: str, in_thread: bool) -> None:
+    one, read = MODES[mode]("cpu"), []
+    expected, surface = by_name(one.render(stacked(PRESS, ink=True))), stacked(PRESS, ink=True)
+    begun = one.start(surface)
+    surface.height[:], surface.contact[:] = GRID.rest, False
+    assert surface.ink is not None
+    surface.ink[:] = 0.0
+    if in_thread:
+        thread = threading.Thread(target=lambda: read.append(by_name(begun())))
+        thread.start()
+        thread.join()
+    else:
+        read.append(by_name(begun()))
+    assert_same(read[0], expected, "arrays written to after the call")
