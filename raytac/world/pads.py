@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 WORLD_PADS: Registry[Any] = Registry(
     "physics", {"rigid": "raytac.world.rigid_pads:rigid_pads", "ipc": "raytac.world.soft_pads:SoftPads"}
 )
-"""What makes world pads, called with ``(composed, models, datas, *, physics, coupling, device)``; ``physics`` is the configuration."""
+"""Maker of world pads, called with ``(composed, models, datas, *, physics, coupling, device)``; ``physics`` is the configuration."""
 
 
 class WorldPads(Protocol):

@@ -1,4 +1,4 @@
-"""Which environments take a step, and those that forget what they went through, in Warp."""
+"""Environments that take a step, and those that forget what they went through, in Warp."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
