@@ -1,6 +1,7 @@
 """Watch a policy and count how often it succeeds: a film of the scene with what the sensors see beside it, and a success rate.
 
     python experiments/play.py experiments/policies/balance_pole_wrench.pt
+    python experiments/play.py runs/train_gpu/PushCube/wrench/seed0/policy.pt
     python experiments/play.py scripted --task LiftCube --episodes 20
 
 Writes ``film.gif`` (``film.mp4`` with ``--mp4``, where the program ffmpeg is installed), ``strip.png`` and ``metrics.json``. The film
@@ -29,6 +30,7 @@ from raytac.optics import OPTICS
 from raytac.report import machine
 
 if TYPE_CHECKING:
+    from experiments.flat_policy import FlatPolicy
     from experiments.ppo_learner import Evaluation, Recipe
 
 
@@ -37,7 +39,7 @@ class Args(CommonOptions):
     """Play a policy; ``seed`` is that of the episode of the film, counted from the first held-out one."""
 
     policy: tyro.conf.Positional[str] = "scripted"
-    """A file that ``train_ppo.py`` has written, or ``scripted``."""
+    """A file that ``train_ppo.py`` or ``train_gpu.py`` has written, or ``scripted``."""
     task: str = "LiftCube"
     """Task of the scripted policy; a file knows its own."""
     episodes: int = 100
@@ -74,21 +76,25 @@ def main(args: Args) -> dict[str, Metric]:
     OPTICS.config_class(args.optics)
     if args.mp4 and shutil.which("ffmpeg") is None:
         raise InputError("mp4", value=True, rule="needs the program ffmpeg; without --mp4 the film is a GIF")
-    recipe = _recipe(args)
-    out = Path("runs/play") / (f"{args.task}_scripted" if recipe is None else Path(args.policy).stem)
+    flat = _flat(args)
+    recipe = None if flat is not None else _recipe(args)
+    task = flat.task if flat is not None else args.task if recipe is None else recipe.task
+    out = Path("runs/play") / (
+        f"{task}_{flat.touch}" if flat else f"{task}_scripted" if recipe is None else Path(args.policy).stem
+    )
     device, files = "cpu" if args.device == "auto" else args.device, ("film.gif", "film.mp4", "strip.png")
     with recorded(args, "play", out=out, device=device, owned=files, packages=("gymnasium",)) as (folder, metrics):
-        metrics |= {"policy": args.policy, "task": args.task if recipe is None else recipe.task, **machine()}
+        metrics |= {"policy": args.policy, "task": task, **machine()}
         if args.film:
             try:
-                film = _film(args, recipe)
+                film = _film(args, recipe) if flat is None else _flat_film(args, flat)
             except BackendError as error:
                 print(f"no film: {error}", file=sys.stderr)
             else:
                 _write_film(film, folder / ("film.mp4" if args.mp4 else "film.gif"))
                 _write_strip(film, folder / "strip.png")
         if args.episodes:
-            result = _rate(args, recipe)
+            result = _rate(args, recipe) if flat is None else _flat_rate(args, flat)
             low, high = result.interval
             metrics |= {
                 "episodes": result.episodes, "failed": result.failures, "success": result.successes / result.episodes, "success_low": low,
@@ -99,6 +105,59 @@ def main(args: Args) -> dict[str, Metric]:
                 f"return {result.mean_return:.1f}, length {result.mean_length:.0f}"
             )
     return metrics
+
+
+def _flat(args: Args) -> FlatPolicy | None:
+    """The policy, if ``train_gpu.py`` has written it."""
+    if args.policy == "scripted":
+        return None
+    try:
+        from experiments.flat_policy import FlatPolicy
+    except ImportError:  # without rsl_rl there are only those of train_ppo.py
+        return None
+    return FlatPolicy(Path(args.policy)) if FlatPolicy.is_one(Path(args.policy)) else None
+
+
+def _flat_rate(args: Args, policy: FlatPolicy) -> Evaluation:
+    """Over held-out seeds, those of ``_rate``."""
+    from experiments.ppo_learner import HELD_OUT, Evaluation
+
+    many = policy.vector(_together(args), device=args.device)
+    returns, lengths, successes, failures = [], [], 0, 0
+    while len(returns) < args.episodes:
+        many.reset(HELD_OUT + 2 * 10**6 + len(returns))
+        seen, count = many.buffers, len(many.buffers["age"])
+        running, earned, steps = np.arange(count) < args.episodes - len(returns), np.zeros(count), 0
+        while running.any():
+            seen["action"][:] = policy(seen["actor"])
+            many.step()
+            earned, steps = earned + seen["reward"] * running, steps + 1
+            ended = running & ((seen["terminated"] + seen["truncated"]) > 0.0)
+            returns += earned[ended].tolist()
+            lengths += [steps] * int(ended.sum())
+            successes += int(seen["success"][ended].sum())
+            failures += int(seen["failed"][ended].sum())
+            running &= ~ended
+    return Evaluation(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)), failures)
+
+
+def _flat_film(args: Args, policy: FlatPolicy) -> Film:
+    """The episode of ``_film``; image and markers are shown, whatever the policy is given."""
+    from experiments.ppo_learner import HELD_OUT, KINDS
+
+    felt = KINDS[policy.task].task.tactile if policy.touch == "task" else policy.tactile or ()
+    every = tuple(name for name in MODALITIES if name in (*felt, "rgb", "markers"))
+    shown = ObservationSettings(every, resolution=(160, 120), optics=args.optics)
+    hidden = [name for name in every if name not in felt]
+    one = policy.vector(1, hidden=hidden, tactile=shown, render_mode="rgb_array", pitch=0.4e-3, device=args.device)
+    one.reset(HELD_OUT + 2 * 10**6 + args.seed)
+    frames, ended = [], False
+    while not ended:
+        frames.append(_picture(one.env.render()))
+        one.buffers["action"][:] = policy(one.buffers["actor"])
+        one.step()
+        ended = bool(one.buffers["terminated"][0] or one.buffers["truncated"][0])
+    return Film(frames, one.layout.control_timestep, tuple(one.env.batch.observers))
 
 
 def _recipe(args: Args) -> Recipe | None:

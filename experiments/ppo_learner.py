@@ -19,16 +19,9 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
+import raytac.envs
 from raytac.checks import check_number, check_numbers, check_seed, check_whole
-from raytac.envs import (
-    BalancePoleVectorEnv,
-    LiftCubeVectorEnv,
-    ProcessVecEnv,
-    PushCubeVectorEnv,
-    RollBallVectorEnv,
-    TactileVecEnv,
-    TactileVectorEnv,
-)
+from raytac.envs import SCRIPTED, ProcessVecEnv, TactileVecEnv, TactileVectorEnv
 from raytac.errors import InputError
 from raytac.io import write_atomic
 from raytac.observe import ObservationSettings
@@ -36,12 +29,7 @@ from raytac.report import wilson_interval
 
 __all__ = ["HELD_OUT", "KINDS", "SMALLEST_SIDE", "Checkpoint", "Evaluation", "Learner", "Recipe", "evaluate", "tactile_settings"]
 
-KINDS: Mapping[str, type[TactileVectorEnv]] = {
-    "PushCube": PushCubeVectorEnv,
-    "BalancePole": BalancePoleVectorEnv,
-    "LiftCube": LiftCubeVectorEnv,
-    "RollBall": RollBallVectorEnv,
-}
+KINDS: Mapping[str, type[TactileVectorEnv]] = {name: getattr(raytac.envs, f"{name}VectorEnv") for name in SCRIPTED}
 HELD_OUT = 2**31
 """Seeds of evaluation start here; those of training are below."""
 SMALLEST_SIDE = 36

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from experiments.running import recorded, run
-from raytac.envs import SCRIPTED, BalancePole, LiftCube, PushCube, RollBall, Start, Task, TaskBatch
+from raytac.envs import SCRIPTED, BalancePole, InsertPeg, LiftCube, OpenDrawer, PushCube, RollBall, Start, Task, TaskBatch
 from raytac.errors import InputError
 from raytac.io import CommonOptions
 from raytac.shapes import object_bounds
@@ -56,6 +56,8 @@ CASES = {
     "lift_cube_env": Case(LiftCube(), "LiftCube"),
     "lift_cube": Case(LiftHere(), "LiftCube"),
     "lift_sphere": Case(LiftHere(), "LiftCube"),
+    "insert_peg": Case(InsertPeg(), "InsertPeg"),
+    "open_drawer": Case(OpenDrawer(), "OpenDrawer"),
 }
 """The shipped task scenes with rigid pads."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
@@ -52,6 +54,8 @@ class TactileFrame:
     What ``OUTPUTS`` names is there if the sensor was asked for it, so ``wrench``, which holds the same force with its torque; markers if
     the sensor has a marker model. ``outputs`` names all that is there. What is not raises ``MissingOutputError``, which says how to ask
     for it.
+
+    Images may still be computed when the frame is there: the first that is read waits for all, and copies them to the host.
     """
 
     surface: GelSurface
@@ -96,13 +100,14 @@ class TactileFrame:
     """Steps of a soft pad's solver that did not meet its tolerance since the press began, or since the world's environment was reset,
     shape (B,), int. An environment whose last step is one of them has ``failed``."""
     time_ms: dict[str, float]
-    """Wall time of ``physics``, ``surface``, ``markers``, ``optics`` for the batch [ms]."""
+    """Wall time of ``physics``, ``surface``, ``markers``, ``optics`` for the batch [ms]. ``optics`` is the time to launch the images and,
+    once one was read, the time that was waited for them."""
 
     label: str
     """Physics and optics that it came from, as ``TactileSensor.label``; empty if unknown."""
 
-    def __init__(self, surface: GelSurface, **values: Any) -> None:
-        """``values``: further fields; None is as if it were not given."""
+    def __init__(self, surface: GelSurface, *, images: Callable[[], Mapping[str, Any]] | None = None, **values: Any) -> None:
+        """``values``: further fields; None is as if it were not given. ``images``: a function that waits for those of ``IMAGES``."""
         known = [f.name for f in fields(type(self))]
         for name in values:
             if name not in known:
@@ -110,21 +115,46 @@ class TactileFrame:
         always: dict[str, Any] = {"failed": np.zeros(surface.batch, bool), "time_ms": {}, "label": ""}
         given = {name: value for name, value in values.items() if value is not None}
         self.__dict__.update({"surface": surface, **always, **given})
+        if images is not None:
+            self.__dict__["_images"] = images
 
     @property
     def outputs(self) -> tuple[str, ...]:
         """Names of all fields that are there."""
+        self._wait()
         return tuple(f.name for f in fields(self) if f.name in self.__dict__)
 
     def with_values(self, **values: Any) -> TactileFrame:
         """The same with other values of some fields; None leaves one out."""
-        return TactileFrame(**{**self.__dict__, **values})
+        if values.keys() & IMAGES:
+            self._wait()
+        own = {"images" if name == "_images" else name: value for name, value in self.__dict__.copy().items()}
+        return TactileFrame(**{**own, **values})
+
+    def _wait(self) -> None:
+        """Wait for the images, if nobody has."""
+        images = self.__dict__.get("_images")
+        if images is None:
+            return
+        began = time.perf_counter()
+        given = {name: value for name, value in images().items() if value is not None}
+        waited = 1e3 * (time.perf_counter() - began)
+        self.__dict__.update(given, time_ms={**self.time_ms, "optics": self.time_ms.get("optics", 0.0) + waited})
+        self.__dict__.pop("_images", None)
+
+    def __getstate__(self) -> dict[str, Any]:
+        self._wait()
+        return self.__dict__.copy()
 
     if not TYPE_CHECKING:  # a type checker knows the fields, and so finds names that do not exist
 
         def __getattr__(self, name: str) -> Any:
             if name not in type(self).__dataclass_fields__:
                 raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            if name in IMAGES:
+                self._wait()
+                if name in self.__dict__:  # another thread may have waited since the lookup that failed
+                    return self.__dict__[name]
             raise MissingOutputError(f"frame.{name}", rule=_ASK.get(name, f'was not asked for: outputs=("{name}", …)'))
 
     def __repr__(self) -> str:

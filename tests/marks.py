@@ -57,6 +57,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "regression",
         "test_sensor_soft.py",
         "test_warp_runtime.py",
+        "world/engine",
         "world/test_held.py",
         "world/test_mujoco_rows.py",
         "world/test_pad_shear.py",
@@ -64,6 +65,7 @@ PLACES: dict[str, tuple[str, ...]] = {
     ),
     "script": (
         "dataset/test_ray_cluster.py",
+        "envs/test_rsl.py",
         "envs/test_sb3.py",
         "examples",
         "experiments",

@@ -15,7 +15,7 @@ import raytac
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ["raytac", *(f"raytac.{module.name}" for module in pkgutil.iter_modules(raytac.__path__) if module.ispkg)]
-ABSENT = ("stable_baselines3", "torch")
+ABSENT = ("rsl_rl", "stable_baselines3", "torch")
 """Packages that no extra of the tests installs: names that need them say so when they are used."""
 USERS = [
     ROOT / "README.md",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
 import subprocess
 import sys
@@ -208,3 +209,29 @@ def test_an_unknown_option_of_the_optics_is_refused_with_the_choices(optics: str
     for name in ("calibratoin", "resolution"):
         with pytest.raises(InputError, match=f"{name} = 1: is no option of optics='{optics}'.*choose from: .*{known}"):
             OPTICS.config(optics, **{name: 1})
+
+
+@pytest.mark.renderer
+def test_images_wait_until_they_are_read() -> None:
+    sensor = TactileSensor("gelsight_mini", optics="phong", outputs=("rgb", "depth"), resolution=(64, 48), pitch=0.4e-3)
+    frame = sensor.press("sphere")
+    launched = frame.time_ms["optics"]
+    other = frame.with_values(label="other")
+    copied, kept = copy.copy(other), pickle.loads(pickle.dumps(other))
+    assert "rgb" in frame.outputs and frame.time_ms["optics"] >= launched
+    for one in (other, copied, kept):
+        np.testing.assert_array_equal(one.rgb, frame.rgb)
+        np.testing.assert_array_equal(one.depth, frame.depth)
+    black = np.zeros_like(frame.rgb)
+    assert sensor.press("sphere").with_values(rgb=black).rgb is black
+    with pytest.raises(MissingOutputError, match="normals"):
+        _ = sensor.press("sphere").normals
+
+
+def test_a_lookup_that_another_thread_overtakes_finds_the_image() -> None:
+    rgb = np.zeros((1, 2, 2, 3), np.uint8)
+    frame = TactileFrame(make_surface(), images=lambda: {"rgb": rgb, "depth": None})
+    assert "rgb" in frame.outputs  # waits, as another thread does between a failed lookup and __getattr__
+    assert TactileFrame.__dict__["__getattr__"](frame, "rgb") is rgb
+    with pytest.raises(MissingOutputError, match="depth"):
+        _ = frame.depth

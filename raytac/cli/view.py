@@ -43,7 +43,7 @@ class ViewArgs(ShadowOptions):
     sensor: str | None = None
     """Name of a shipped sensor, or path of a sensor file; a task names its own, a press takes gelsight_mini if not given."""
     physics: Annotated[str | None, named(PHYSICS.names)] = None
-    """Model of the gel: rigid (geometry and Gaussians) or ipc (finite elements; needs raytac[ipc]). If not given, as the scene says,
+    """Model of the gel: rigid (geometry and Gaussians) or ipc (finite elements). If not given, as the scene says,
     else rigid."""
     level: Annotated[str | None, named(PADS)] = None
     """Resolution of a soft pad's mesh, so that physics is ipc if not given; as the scene says if not given, else coarse."""

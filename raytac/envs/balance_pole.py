@@ -1,4 +1,4 @@
-"""``raytac/BalancePole-v0``."""
+"""``raytac/BalancePole-v1``."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class BalancePole(Task):
         axis = state.body[:, :3, 2]
         tilt = np.arccos(np.clip(axis[:, 2], -1.0, 1.0))
         foot = state.body[:, :3, 3] - 0.15 * axis
-        terminated = (distances(foot, state.tool[:, :3, 3]) > 0.05) | (state.body[:, 2, 3] < 0.4) | (tilt > np.pi / 2)
+        terminated = (distances(foot, state.tool[:, :3, 3]) > 0.05) | (state.body[:, 2, 3] < 0.4) | (tilt > np.pi / 6)
         terms = {
             "alive": 1.0 * ~terminated,
             "terminated": -2.0 * terminated,
@@ -80,10 +80,12 @@ class BalancePoleEnv(TactileEnv):
     | `joint_speed` | −1e-4 \|q̇\|² [rad/s] (the same) |
 
     Start: the pole leans by 0 to 2° in any direction, its foot within ±1 mm of the pad's centre. The goal is the pad's start.
-    Termination: the foot is more than 50 mm from the pad's centre (TacEx), the pole's centre below 0.4 m or its tilt above 90° (TacEx
-    thesis).
+    Termination: the foot is more than 50 mm from the pad's centre (TacEx), the pole's centre below 0.4 m (TacEx thesis) or its tilt
+    above 30°.
     Truncation: 250 steps (5 s), or the physics fails. Success: not terminated, and the tilt is below 12°.
 
+    Version 1: an episode ends at a tilt of 30°, not of 90° (TacEx thesis). Nothing brings the pole back from there, and half of an
+    untrained policy's steps were those of its fall.
     Version 0: first release.
     """
 

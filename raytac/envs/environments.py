@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection
 from typing import Any, ClassVar
@@ -15,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from raytac.envs.batch import StepResult, TaskBatch
+from raytac.envs.processes import serve
 from raytac.envs.task_rules import Task
 from raytac.errors import InputError
 from raytac.gel.surface import chosen_envs
@@ -245,32 +244,17 @@ class TactileVectorEnv(_Task, gymnasium.vector.VectorEnv):
 
 
 def serve_vector(pipe: Connection, kind: type[TactileVectorEnv], num_envs: int, options: dict[str, Any]) -> None:
-    """Make a vector in this process and reply to commands until the pipe is closed; no learner's library is imported.
+    """Serve a vector (``raytac.envs.processes.serve``); no learner's library is imported.
 
-    A command is ``("reset", seeds)`` or ``("step", actions)``. A reply is (success, return value or error, traceback). The first reply is
-    sent without a command: observation and action space of one environment. Ctrl-C is left to the caller.
+    The first reply holds observation and action space of one environment; commands are ``("reset", seeds)`` and ``("step", actions)``.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
+
+    def make() -> tuple[Any, dict[str, Callable[[Any], Any]]]:
         env = kind(num_envs, **options)
-        pipe.send((True, (env.single_observation_space, env.single_action_space), ""))
-    except Exception as error:
-        pipe.send((False, error, traceback.format_exc()))
-        return
-    commands: dict[str, Callable[[Any], Any]] = {"reset": lambda seeds: env.reset(seed=seeds), "step": env.step}
-    while True:
-        try:
-            command, value = pipe.recv()
-        except (EOFError, ConnectionResetError):
-            return
-        try:
-            reply = True, commands[command](value), ""
-        except Exception as error:
-            reply = False, error, traceback.format_exc()
-        try:
-            pipe.send(reply)
-        except (BrokenPipeError, ConnectionResetError):
-            return
+        spaces = env.single_observation_space, env.single_action_space
+        return spaces, {"reset": lambda seeds: env.reset(seed=seeds), "step": env.step}
+
+    serve(pipe, make)
 
 
 class EnvironmentPicture:

@@ -1,4 +1,4 @@
-"""``raytac/LiftCube-v0``."""
+"""``raytac/LiftCube-v1``."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ import numpy as np
 from raytac.envs.environments import TactileEnv, TactileVectorEnv
 from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, distances, near
 from raytac.se3 import pose
+
+_LIFTED = 0.04
+"""Height of the centre of a lifted cube [m]; at rest it is 0.015."""
 
 
 class LiftCube(Task):
@@ -34,15 +37,19 @@ class LiftCube(Task):
 
     def evaluate(self, state: TaskState) -> TaskResult:
         cube = state.body[:, :3, 3]
-        lifted, distance = cube[:, 2] > 0.04, distances(cube, state.goal)
+        reach, distance = distances(state.tool[:, :3, 3], cube), distances(cube, state.goal)
+        held = np.minimum(-state.wrench["left"][:, 2], -state.wrench["right"][:, 2]) > 0.5
+        rise = held * np.clip((cube[:, 2] - 0.0155) / (_LIFTED - 0.0155), 0.0, 1.0)
         terms = {
-            "reaching": near(distances(state.tool[:, :3, 3], cube), 0.1),
-            "lifted": 15.0 * lifted,
-            "goal": 16.0 * lifted * near(distance, 0.3),
-            "goal_fine": 5.0 * lifted * near(distance, 0.05),
+            "reaching": near(reach, 0.1),
+            "reaching_fine": near(reach, 0.02),
+            "held": 2.0 * held,
+            "lifted": 15.0 * rise,
+            "goal": 16.0 * rise * near(distance, 0.3),
+            "goal_fine": 5.0 * rise * near(distance, 0.05),
         }
-        terminated = distances(state.tool[:, :3, 3], cube) > 1.0
-        return TaskResult({**terms, **self.effort(state)}, terminated, lifted & (distance < 0.02))
+        success = (cube[:, 2] > _LIFTED) & (distance < 0.02)
+        return TaskResult({**terms, **self.effort(state)}, reach > 1.0, success)
 
 
 class LiftCubeEnv(TactileEnv):
@@ -64,23 +71,28 @@ class LiftCubeEnv(TactileEnv):
       velocity [rad/s] (6); there unless `body_seen=False`;
     - `left_markers`, `right_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` selects others (docs/rl.md).
 
-    Reward: sum of the terms in `info["reward_terms"]`, those of Isaac Lab's Isaac-Lift-Cube-Franka-v0.
-    Lifted: the cube's centre is above 0.04 m.
+    Reward: sum of the terms in `info["reward_terms"]`, those of Isaac Lab's Isaac-Lift-Cube-Franka-v0 and two that lead up to them.
+    Held: both pads are pressed with more than 0.5 N. r rises from 0 where the cube's centre is 15.5 mm high, which is a hair above rest,
+    to 1 at 40 mm; it is 0 if the cube is not held.
 
-    | term | value |
-    | --- | --- |
-    | `reaching` | 1 − tanh(d(tool, cube) / 0.1) |
-    | `lifted` | 15 if lifted |
-    | `goal` | 16 (1 − tanh(d(cube, goal) / 0.3)) if lifted |
-    | `goal_fine` | 5 (1 − tanh(d(cube, goal) / 0.05)) if lifted |
-    | `action_rate` | −1e-4 \|a − a₋₁\|² |
-    | `joint_speed` | −1e-4 \|q̇\|² [rad/s] |
+    | term | value | source |
+    | --- | --- | --- |
+    | `reaching` | 1 − tanh(d(tool, cube) / 0.1) | Isaac Lab |
+    | `reaching_fine` | 1 − tanh(d(tool, cube) / 0.02) | ours |
+    | `held` | 2 if held | ours |
+    | `lifted` | 15 r | Isaac Lab, where r is 1 above 40 mm, else 0 |
+    | `goal` | 16 r (1 − tanh(d(cube, goal) / 0.3)) | the same |
+    | `goal_fine` | 5 r (1 − tanh(d(cube, goal) / 0.05)) | the same |
+    | `action_rate` | −1e-4 \|a − a₋₁\|² | Isaac Lab |
+    | `joint_speed` | −1e-4 \|q̇\|² [rad/s] | Isaac Lab |
 
     Start: the open gripper is above the table, the cube within ±30 mm of its position in the scene along x and y; the goal is within ±50 mm
     of that position along x and y, 80 to 200 mm high.
     Termination: the tool is more than 1 m from the cube (TacEx thesis). Truncation: 250 steps (5 s, as Isaac Lab), or the physics fails.
-    Success: lifted, and within 20 mm of the goal.
+    Success: the cube's centre is above 40 mm and within 20 mm of the goal.
 
+    Version 1: a lift is worth more the higher it is, and a grasp is worth something. In version 0 nothing was worth anything between
+    reaching the cube and having it 25 mm above the table, and PPO stayed at reaching it.
     Version 0: first release.
     """
 

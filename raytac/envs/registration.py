@@ -11,14 +11,24 @@ try:
 except ModuleNotFoundError as error:
     raise BackendError("Gymnasium is not installed: pip install 'raytac[rl]'") from error
 
-_MODULES: Final = {"PushCube": "push_cube", "BalancePole": "balance_pole", "LiftCube": "lift_cube", "RollBall": "roll_ball"}
-IDS: Final = tuple(f"raytac/{name}-v0" for name in _MODULES)
+_MODULES: Final = {
+    "PushCube": "push_cube",
+    "BalancePole": "balance_pole",
+    "LiftCube": "lift_cube",
+    "RollBall": "roll_ball",
+    "InsertPeg": "insert_peg",
+    "OpenDrawer": "open_drawer",
+}
+_VERSIONS: Final = {"PushCube": 0, "BalancePole": 1, "LiftCube": 1, "RollBall": 1, "InsertPeg": 0, "OpenDrawer": 0}
+"""A task has one version, which its docstring tells the history of; Gymnasium names it to who asks for an older one."""
+_NAMES: Final = {name: f"raytac/{name}-v{version}" for name, version in _VERSIONS.items()}
+IDS: Final = tuple(_NAMES.values())
 """Names that ``gymnasium.make`` and ``gymnasium.make_vec`` take once ``raytac.envs`` is imported."""
 
 
 def register_envs() -> None:
     """Register all, each as one environment and as a vector. Episodes end by themselves, so there is no time limit around them."""
     for name, module in _MODULES.items():
-        if f"raytac/{name}-v0" not in gymnasium.registry:
+        if _NAMES[name] not in gymnasium.registry:
             where = f"raytac.envs.{module}:{name}"
-            gymnasium.register(f"raytac/{name}-v0", entry_point=f"{where}Env", vector_entry_point=f"{where}VectorEnv")
+            gymnasium.register(_NAMES[name], entry_point=f"{where}Env", vector_entry_point=f"{where}VectorEnv")

@@ -1,4 +1,4 @@
-"""``raytac/RollBall-v0``."""
+"""``raytac/RollBall-v1``."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ class RollBall(Task):
             "goal_wide": 0.75 * near(distance, 0.6),
             "goal": 1.25 * near(distance, 0.2),
             "goal_narrow": 1.75 * (1.0 - np.square(np.tanh(distance / 0.08))),
+            "goal_fine": 4.0 * near(distance, 0.005),
             "reached": 5.0 * ((distance < 0.002) & touching),
         }
         off = (np.abs(ball[:, 0] - 0.5) > 0.3) | (np.abs(ball[:, 1]) > 0.4) | (distance > 0.75)
@@ -73,6 +74,7 @@ class RollBallEnv(TactileEnv):
     | `aside` | −0.05 (d_xy(ball, pad) in cm)² |
     | `lost_height` | −15 if the ball's centre is above 25 mm |
     | `goal_wide`, `goal`, `goal_narrow` | 0.75 (1 − tanh(d / 0.6)), 1.25 (1 − tanh(d / 0.2)), 1.75 (1 − tanh²(d / 0.08)) |
+    | `goal_fine` | 4 (1 − tanh(d / 0.005)); ours |
     | `reached` | 5 if d < 2 mm (TacEx: 5 mm, for goals half a metre away) and touching |
     | `action_rate`, `joint_speed` | −1e-4 \|a − a₋₁\|², −1e-4 \|q̇\|² |
 
@@ -83,6 +85,7 @@ class RollBallEnv(TactileEnv):
     Termination (TacEx): the ball's x is not in 0.2 to 0.8 m, |y| > 0.4 m, d > 0.75 m, d_xy(ball, pad) > 15 mm, or the pad is below 2 mm.
     Truncation: 150 steps (3 s), or the physics fails. Success: d < 2 mm.
 
+    Version 1: `goal_fine`. The other terms are those of goals half a metre away: over the 5 to 10 mm of this task they change by 0.03.
     Version 0: first release.
     """
 

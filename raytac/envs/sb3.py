@@ -5,11 +5,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from multiprocessing.connection import Connection
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,27 +13,11 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
 from raytac.envs.environments import TactileVectorEnv, serve_vector
+from raytac.envs.processes import Workers
 from raytac.errors import InputError
-
-_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 Observations = dict[str, np.ndarray]
 Step = tuple[Observations, np.ndarray, np.ndarray, list[dict[str, Any]]]
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Give processes that start within one thread of BLAS each; many processes share the cores."""
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))  # read when NumPy loads, so they must stand before a process starts
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 class _DictVecEnv(VecEnv):
@@ -118,31 +98,16 @@ class ProcessVecEnv(_DictVecEnv):
         Raises:
             InputError: a number of environments that the processes cannot share evenly; as ``TaskBatch``.
         """
-        if processes < 1 or num_envs < 1 or num_envs % processes:
-            rule = f"must be a multiple of the number of processes, which is {processes} and must be at least 1"
-            raise InputError("num_envs", value=num_envs, rule=rule)
-        each = num_envs // processes
-        context = multiprocessing.get_context("spawn")
-        self._workers: list[tuple[Any, Connection]] = []
-        with one_thread():
-            for k in range(processes):
-                mine, theirs = context.Pipe()
-                arguments = theirs, kind, each, {**options, "seed": seed + k * each}
-                worker = context.Process(target=serve_vector, args=arguments, daemon=True, name=f"raytac-envs-{k}")
-                worker.start()
-                theirs.close()
-                self._workers.append((worker, mine))
-        self._each = each
-        spaces = self._replies()
-        super().__init__(num_envs, *spaces[0])
+        self._workers = Workers(serve_vector, kind, num_envs, processes, seed, **options)
+        super().__init__(num_envs, *self._workers.made[0])
 
     def reset(self) -> Observations:
         """As ``TactileVecEnv.reset``."""
-        for k, (_, pipe) in enumerate(self._workers):
-            pipe.send(("reset", self._seeds[k * self._each : (k + 1) * self._each]))
+        each = self._workers.each
+        self._workers.send("reset", [self._seeds[k * each : (k + 1) * each] for k in range(len(self._workers))])
         self._reset_seeds()
         self._reset_options()
-        return _joined([observation for observation, _ in self._replies()])
+        return _joined([observation for observation, _ in self._workers.replies()])
 
     def step_async(self, actions: np.ndarray) -> None:
         """Start the step in all processes. Raises ``InputError``, naming the environment, for actions that are not finite."""
@@ -150,38 +115,17 @@ class ProcessVecEnv(_DictVecEnv):
         if not np.isfinite(actions).all():
             env = int(np.argwhere(~np.isfinite(actions))[0, 0])
             raise InputError("actions", value=actions[env].tolist(), rule=f"must be finite; in environment {env} they are not")
-        for (_, pipe), rows in zip(self._workers, np.split(actions, len(self._workers)), strict=True):
-            pipe.send(("step", rows))
+        self._workers.send("step", np.split(actions, len(self._workers)))
 
     def step_wait(self) -> Step:
         """Wait for the step. Raises as ``TactileVecEnv.step_wait``; the message names the process and its environments."""
-        steps = [_vec_env_step(*reply) for reply in self._replies()]
+        steps = [_vec_env_step(*reply) for reply in self._workers.replies()]
         observations, rewards, dones, infos = zip(*steps, strict=True)
         return _joined(observations), np.concatenate(rewards), np.concatenate(dones), [info for part in infos for info in part]
 
     def close(self) -> None:
         """End the processes."""
-        for worker, pipe in self._workers:
-            pipe.close()
-            worker.join(timeout=5.0)
-            if worker.is_alive():
-                worker.terminate()
-        self._workers = []
-
-    def _replies(self) -> list[Any]:
-        """One reply of every process. All are read before an error is raised, so that none is mistaken for a later one."""
-        replies = []
-        for k, (worker, pipe) in enumerate(self._workers):
-            try:
-                replies.append(pipe.recv())
-            except (EOFError, ConnectionResetError):
-                replies.append((False, RuntimeError(f"process {k} ended by itself, exit code {worker.exitcode}"), ""))
-        for k, (fine, value, where) in enumerate(replies):
-            if not fine:
-                name = f"environments {k * self._each} to {(k + 1) * self._each - 1}, in process {k}"
-                value.add_note(f"raised by {name}:\n{where}")
-                raise value
-        return [value for _, value, _ in replies]
+        self._workers.close()
 
 
 def _joined(parts: Sequence[Observations]) -> Observations:

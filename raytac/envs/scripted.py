@@ -8,6 +8,8 @@ from typing import Final
 import numpy as np
 
 from raytac.envs.batch import TaskBatch
+from raytac.envs.insert_peg import RIM, SOCKET
+from raytac.envs.open_drawer import handle_of
 
 GAINS = np.array([-5.2, -5.0, -32.4, -4.6])
 """Feedback gains of x, ẋ, θ, θ̇ (see ``balance_pole``)."""
@@ -59,10 +61,44 @@ def lift_cube(batch: TaskBatch) -> np.ndarray:
     return action
 
 
+def insert_peg(batch: TaskBatch) -> np.ndarray:
+    """Grasp the peg, lift it, carry it over the true place of the socket, which the observation does not tell, and put it in."""
+    peg, axis, tool = batch.body[:, :3, 3], batch.body[:, :3, 2], batch.tool[:, :3, 3]
+    tip = peg - 0.025 * axis
+    grasped, action = _grasp(batch, peg + 0.011 * axis - tool)
+    aside = np.concatenate([SOCKET - tip[:, :2], np.zeros((len(tip), 1))], axis=1)
+    distance, high = np.linalg.norm(aside, axis=1), tip[:, 2] > RIM + 2e-3
+    inside = (tip[:, 2] < RIM) & (distance < 1e-3)
+    carry = np.where((high | inside)[:, None], aside, 0.0)
+    carry[:, 2] = np.where(inside | (distance < 3e-4), -4e-3, RIM + 6e-3 - tip[:, 2])
+    action[grasped, :3] = 0.5 * np.clip(carry[grasped] / 4e-3, -1.0, 1.0)
+    return action
+
+
+def open_drawer(batch: TaskBatch) -> np.ndarray:
+    """Grasp the handle and pull it to the goal."""
+    handle = handle_of(batch.body)
+    grasped, action = _grasp(batch, handle - batch.tool[:, :3, 3])
+    action[grasped, :3] = 0.5 * np.clip((batch.goal - handle)[grasped] * [1.0, 0.0, 0.0] / 4e-3, -1.0, 1.0)
+    return action
+
+
+def _grasp(batch: TaskBatch, off: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pads that hold something (B,), and actions (B, 4) that bring the tool to a place ``off`` [m] (B, 3) from it and close there."""
+    force = np.minimum(*(-batch.world.state().wrench[name][:, 2] for name in ("left", "right")))
+    grasped, over, down = force > 3.0, np.linalg.norm(off[:, :2], axis=1) < 2e-3, np.abs(off[:, 2]) < 2e-3
+    action = np.zeros((len(off), 4))
+    action[:, :3] = np.clip(np.where(over[:, None], off, off * [1.0, 1.0, 0.0]) / 4e-3, -1.0, 1.0)
+    action[:, 3] = np.where(grasped, np.where(force > 8.0, 0.05, 0.0), np.where(over & down, -0.3, 0.0))
+    return grasped, action
+
+
 SCRIPTED: Final[Mapping[str, Callable[[TaskBatch], np.ndarray]]] = {
     "PushCube": push_cube,
     "BalancePole": balance_pole,
     "LiftCube": lift_cube,
     "RollBall": roll_ball,
+    "InsertPeg": insert_peg,
+    "OpenDrawer": open_drawer,
 }
 """Actions (B, k) from a batch, by the name of the task."""

@@ -55,7 +55,7 @@ class SurfaceMarkers(MarkersConfig):
 
 @dataclass(frozen=True)
 class Superposition(MarkersConfig):
-    """Superposition of the pad's unit-load fields; needs ``raytac[ipc]`` for the pad's tetrahedra, and no fit."""
+    """Superposition of the pad's unit-load fields; no fit."""
 
     follows_shear: ClassVar[bool] = True
     level: str = "coarse"

@@ -37,7 +37,8 @@ class OpticalMode(Protocol):
     """One way to make images, built once for one sensor, resolution and set of outputs.
 
     Modes that render on the device have ``mi``, ``camera``, ``outputs``, ``prepare(grid)`` and
-    ``render_device(heights, contact=None, ink=None)`` too, as ``raytac.optics.DeviceMode`` says.
+    ``render_device(heights, contact=None, ink=None)`` too, as ``raytac.optics.DeviceMode`` says; those that compute beside their caller
+    have ``start(surface)``.
     """
 
     label: str
@@ -48,6 +49,15 @@ class OpticalMode(Protocol):
     def render(self, surface: GelSurface) -> OpticsImages:
         """Render every environment of ``surface``."""
         ...
+
+
+def start(mode: OpticalMode, surface: GelSurface) -> Callable[[], OpticsImages]:
+    """Begin the images of a surface, and return a function that waits for them; a mode without ``start`` renders at once."""
+    begin: Callable[[GelSurface], Callable[[], OpticsImages]] | None = getattr(mode, "start", None)
+    if begin is not None:
+        return begin(surface)
+    images = mode.render(surface)
+    return lambda: images
 
 
 Mode = TypeVar("Mode", bound=OpticalMode)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from raytac.errors import InputError
 from raytac.frame import IMAGES
 from raytac.gel.surface import GelSurface
-from raytac.optics.base import OpticalMode, OpticsConfig, OpticsImages
+from raytac.optics.base import OpticalMode, OpticsConfig, OpticsImages, start
 from raytac.specs.sensor import SensorSpec
 
 
@@ -78,7 +79,14 @@ class CutMode:
 
     def render(self, surface: GelSurface) -> OpticsImages:
         """Render every environment of ``surface`` and cut."""
-        images = self._mode.render(surface)
+        return self.start(surface)()
+
+    def start(self, surface: GelSurface) -> Callable[[], OpticsImages]:
+        """Begin ``render``, if the mode can."""
+        images = start(self._mode, surface)
+        return lambda: self._pieces(images())
+
+    def _pieces(self, images: OpticsImages) -> OpticsImages:
         return OpticsImages(**{name: self._cut(getattr(images, name, None)) for name in IMAGES})
 
     def _cut(self, image: Any) -> Any:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -97,6 +99,8 @@ class DeviceMode(ABC):
         self._frozen: dict[tuple[str, bool, int], Callable[..., Any]] = {}
         self._at_rest: OpticsImages | None = None
         """Images of one untouched pad, which every environment at rest shows."""
+        self._is_running = False
+        """True if nobody has waited for the images that were begun last."""
         self._set_up()
 
     def _set_up(self) -> None:  # noqa: B027 (a mode may need nothing more)
@@ -193,15 +197,45 @@ class DeviceMode(ABC):
         Raises:
             InputError: a surface whose arrays do not have the shape of its grid, an empty batch, one too large, or a second grid.
         """
+        return self.start(surface)()
+
+    def start(self, surface: GelSurface) -> Callable[[], OpticsImages]:
+        """Begin ``render``, and return a function that waits for the images and copies them to the host.
+
+        Dr.Jit computes them beside what the caller does next. At most one call is under way: the next one waits for it. Dr.Jit lets
+        only the thread that launched a kernel wait for it, so in another thread the function renders the surface again.
+        The arrays of ``surface`` may be written to at once: the images are those of its values at the call.
+
+        Raises the same as ``render``.
+        """
+        if self._is_running:
+            dr.sync_thread()
+        # Copies: on the CPU Dr.Jit reads NumPy memory in place, when the kernel runs.
+        ink = None if surface.ink is None else surface.ink.copy()
+        surface = replace(surface, height=surface.height.copy(), contact=surface.contact.copy(), ink=ink)
         heights, failed = self._checked(surface)
         pressed = self._pressed(surface, heights, failed)
-        if len(pressed) == surface.batch:
-            return self._rendered(surface, heights, failed)
-        if self._at_rest is None:
+        whole = len(pressed) == surface.batch
+        if not whole and self._at_rest is None:
             rest = GelSurface.at_rest(surface.grid)
-            self._at_rest = self._rendered(rest, rest.height, np.zeros(1, bool))
-        images = self._rendered(surface.rows(pressed), heights[pressed], failed[pressed]) if pressed else None
-        return _spread(self._at_rest, images, pressed, surface.batch)
+            self._at_rest = self._begun(rest, rest.height, np.zeros(1, bool))()
+        begun = None
+        if pressed:
+            rows = (surface, heights, failed) if whole else (surface.rows(pressed), heights[pressed], failed[pressed])
+            begun, self._is_running = self._begun(*rows), True
+        caller = threading.get_ident()
+
+        def images() -> OpticsImages:
+            if threading.get_ident() != caller:
+                return self.render(surface)
+            self._is_running = False
+            some = None if begun is None else begun()
+            if whole and some is not None:
+                return some
+            assert self._at_rest is not None
+            return _spread(self._at_rest, some, pressed, surface.batch)
+
+        return images
 
     def _pressed(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> list[int]:
         """Environments that have to be rendered, as many as some power of two; the others show the image at rest.
@@ -216,8 +250,14 @@ class DeviceMode(ABC):
         rounded = rounded_envs(pressed, surface.batch) if pressed else []
         return rounded if len(rounded) < surface.batch else list(range(surface.batch))
 
-    def _rendered(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> OpticsImages:
-        return self._images(surface, heights, failed, self._lit_images(surface, heights, failed) if self._lit else {})
+    def _begun(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> Callable[[], OpticsImages]:
+        """Launch the images of heights (B, Ny, Nx) that are safe to trace; the function that is returned waits for them."""
+        lit = seen = None
+        if self._lit:
+            lit = self.render_device(self._upload(heights), self._upload_contact(surface, failed), self._upload_ink(surface))
+        if {"normals", "depth"} & set(self.outputs):
+            seen = self._recorded(self._seen, self._upload(heights), None, None)
+        return partial(self._images, surface, failed, lit, seen)
 
     def render_device(self, heights: Float, contact: UInt8 | None = None, ink: Float | None = None) -> DeviceFrame:
         """Images on the device, of device arrays; recorded at the first call of a batch size and replayed afterwards.
@@ -237,17 +277,20 @@ class DeviceMode(ABC):
         self._check_batch(device_envs(self.layout.nx * self.layout.ny, heights, **others), self._grid)
         return DeviceFrame(*self._recorded(self._frame, heights, contact if self.needs_contact else None, ink))
 
-    def _lit_images(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> dict[str, Any]:
-        """Fields of ``OpticsImages`` that show light, of heights (B, Ny, Nx) that are safe to trace."""
-        frame = self.render_device(self._upload(heights), self._upload_contact(surface, failed), self._upload_ink(surface))
-        images = {"rgb": np.array(frame.rgb).reshape(*self._shape(len(heights)), 3)} if "rgb" in self.outputs else {}
-        return images | self._other_images(frame, failed)
+    def _images(
+        self, surface: GelSurface, failed: np.ndarray, lit: DeviceFrame | dict[str, Any] | None, seen: tuple[Any, Any] | None
+    ) -> OpticsImages:
+        """Images on the host, with the failed environments marked.
 
-    def _images(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray, images: dict[str, Any]) -> OpticsImages:
-        """``images`` and those of the geometry, with the failed environments marked."""
-        if {"normals", "depth"} & set(self.outputs):
-            p, n = self._recorded(self._seen, self._upload(heights), None, None)
-            images = images | seen_images(p, n, surface, self.camera, self.outputs)
+        ``lit``: of light, on the device or on the host; ``seen``: point and normal through every pixel. None is not asked for.
+        """
+        images: dict[str, Any] = lit if isinstance(lit, dict) else {}
+        if isinstance(lit, DeviceFrame):
+            if "rgb" in self.outputs:
+                images["rgb"] = np.array(lit.rgb).reshape(*self._shape(len(failed)), 3)
+            images |= self._other_images(lit, failed)
+        if seen is not None:
+            images |= seen_images(*seen, surface, self.camera, self.outputs)
         if failed.any():
             layers = images.get("layers") or {}
             for image in (*(one for one in images.values() if isinstance(one, np.ndarray)), *layers.values()):

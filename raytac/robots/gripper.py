@@ -92,7 +92,12 @@ def floating_gripper(
         finger = hand.add_body(name=f"{side}_finger", quat=(1.0, 0.0, 0.0, 0.0) if sign > 0 else (0.0, 0.0, 0.0, 1.0))
         finger.gravcomp = 1.0
         finger.add_joint(
-            name=f"{side}_slide", type=slide, axis=(0, 1, 0), range=(0.0, 0.5 * settings.opening), limited=True, damping=0.3
+            name=f"{side}_slide",
+            type=slide,
+            axis=(0, 1, 0),
+            range=(0.0, 0.5 * settings.opening),
+            limited=True,
+            damping=0.3,
         )
         finger.add_geom(
             name=f"{side}_holder",
@@ -115,12 +120,17 @@ def floating_gripper(
 
 
 def add_opening_servo(spec: mujoco.MjSpec, joints: Iterable[str], settings: GripperSettings) -> None:
-    """Add the position actuator ``opening`` [m] of the sum of the fingers' joints."""
+    """Add the position actuator ``opening`` [m] of the sum of the fingers' joints.
+
+    Its damping goes into the joints. That of a servo on a tendon over two fingers MuJoCo integrates explicitly in part, and not at all at
+    the bound of its force.
+    """
+    gain, damping, greatest_force = settings.servo
     tendon = spec.add_tendon(name="opening")
     for joint in joints:
         tendon.wrap_joint(joint, 1.0)
-    gain, damping, greatest_force = settings.servo
-    servo = _servo(spec, "opening", mujoco.mjtTrn.mjTRN_TENDON, gain, damping)
+        spec.joint(joint).damping[0] += 2.0 * damping
+    servo = _servo(spec, "opening", mujoco.mjtTrn.mjTRN_TENDON, gain, 0.0)
     servo.ctrllimited, servo.ctrlrange = True, (0.0, settings.opening)
     servo.forcelimited, servo.forcerange = True, (-greatest_force, greatest_force)
 

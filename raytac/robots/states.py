@@ -6,9 +6,6 @@ arrays that are named here stay where they are as long as the state lives, so th
 
 from __future__ import annotations
 
-import ctypes
-import functools
-import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -18,7 +15,8 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from raytac.errors import BackendError, InputError
+from raytac.errors import InputError
+from raytac.robots.mujoco_memory import checked_layouts, same_states
 from raytac.robots.state_kernels import Entries, read_numbers, write_numbers
 from raytac.warp_runtime import Recorded, start_warp
 
@@ -112,7 +110,7 @@ class StateReader:
 
     def reads(self, datas: Sequence[mujoco.MjData]) -> bool:
         """True if it reads these states."""
-        return len(datas) == len(self._datas) and all(map(operator.is_, datas, self._datas))
+        return same_states(datas, self._datas)
 
     def values(self) -> dict[str, np.ndarray]:
         """Read all numbers; new NumPy arrays (B, …) by name."""
@@ -143,7 +141,7 @@ class ControlWriter:
 
     def writes(self, datas: Sequence[mujoco.MjData]) -> bool:
         """True if it writes to these states."""
-        return len(datas) == len(self._datas) and all(map(operator.is_, datas, self._datas))
+        return same_states(datas, self._datas)
 
     def write(self, envs: Sequence[int] | np.ndarray) -> np.ndarray | None:
         """Write the controls of environments; returns those of the first one in which they are not finite, and writes nothing then."""
@@ -173,21 +171,5 @@ def _check(datas: Sequence[mujoco.MjData], entries: Numbers) -> None:
 def _place(data: mujoco.MjData, name: str) -> int:
     """Address of an array of a state, or of its time."""
     if name == "time":
-        return data._address + _time_offset()
+        return data._address + checked_layouts()[0].offset["time"]
     return int(getattr(data, name).__array_interface__["data"][0])
-
-
-@functools.cache
-def _time_offset() -> int:
-    """Offset of the time in MuJoCo's structure of a state [byte]. Python asks each state for it, which takes longer than all its arrays.
-
-    It is where a number that is set as the time is seen first. Raises ``BackendError`` if another one is not seen there.
-    """
-    data, offset = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>")), 0
-    data.time = 0.12345678901234567
-    while ctypes.c_double.from_address(data._address + offset).value != data.time:
-        offset += 8
-    data.time = 0.76543210987654321
-    if ctypes.c_double.from_address(data._address + offset).value != data.time:
-        raise BackendError(f"MuJoCo {mujoco.__version__} keeps the time of a state in an unknown place")
-    return offset

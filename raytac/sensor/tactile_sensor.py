@@ -6,7 +6,7 @@ A press or a surface goes in, a ``TactileFrame`` comes out.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from raytac.markers.base import MarkersConfig
 from raytac.markers.pattern import MarkerPattern, dot_ink
 from raytac.markers.registry import MARKERS
 from raytac.markers.tracker import MarkerFrame, MarkerTracker
-from raytac.optics.base import OPTICAL_OUTPUTS, BuiltOptics
+from raytac.optics.base import OPTICAL_OUTPUTS, BuiltOptics, OpticsImages, start
 from raytac.optics.registry import chosen_optics
 from raytac.physics.base import Pad, PadReading, PhysicsConfig
 from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
@@ -208,10 +208,10 @@ class TactileSensor:
         """
         press = press_of(scene, depth=depth, scale=scale, pitch=pitch)
         validate_press(self.spec, press)
-        start = time.perf_counter()
+        began = time.perf_counter()
         pad = self.load(press, **own)
         reading = pad.peak(self._followed(pad.run(progress=progress)))
-        physics_ms = 1e3 * (time.perf_counter() - start)
+        physics_ms = 1e3 * (time.perf_counter() - began)
         frame = self.update(reading)
         return frame.with_values(time_ms={"physics": physics_ms, **frame.time_ms})
 
@@ -279,7 +279,7 @@ class TactileSensor:
             InputError: neither of both, a reading of another scene than was loaded last, a surface of another sensor's pad; ``envs``
                 that do not exist, or not one for each row.
         """
-        start = time.perf_counter()
+        began = time.perf_counter()
         envs = None if envs is None else chosen_envs(envs, self.num_envs)
         reading = PadReading(state) if isinstance(state, GelSurface) else state
         if not isinstance(reading, PadReading):
@@ -296,12 +296,12 @@ class TactileSensor:
             raise InputError("envs", value=len(envs), rule=f"must name one environment for each of {surface.batch} rows")
         forces = self._forces(reading)
         done = time.perf_counter()
-        time_ms = {"surface": 1e3 * (done - start)}
+        time_ms = {"surface": 1e3 * (done - began)}
         markers = None
         if self.markers is not None:
             markers = self.marker_tracker.update(surface, envs, shear=reading.shear)
             surface, done = self._dotted(surface, markers), time.perf_counter()
-            time_ms["markers"] = 1e3 * (done - start) - time_ms["surface"]
+            time_ms["markers"] = 1e3 * (done - began) - time_ms["surface"]
         return self._frame(surface, markers, done, time_ms, **forces)
 
     def _forces(self, reading: PadReading) -> dict[str, Any]:
@@ -346,8 +346,7 @@ class TactileSensor:
         """The frame with the images that are asked for; ``done``: when the surface was there."""
         fields |= {"height": surface.height if "height" in self.outputs else None, "markers": markers}
         if self._optical_outputs:
-            images = self.optical_mode.render(surface)
-            fields |= {name: getattr(images, name, None) for name in IMAGES}
+            fields["images"] = partial(_by_name, start(self.optical_mode, surface))
             time_ms["optics"] = 1e3 * (time.perf_counter() - done)
         return TactileFrame(surface, time_ms=time_ms, label=self.label, **fields)  # a mode is named once it is built
 
@@ -356,14 +355,14 @@ class TactileSensor:
 
         ``envs``: as in which environments the markers are placed, one row each; all are alike but for a pattern that is shifted or turned.
         """
-        start, one, markers = time.perf_counter(), GelSurface.at_rest(self.grid), None
+        began, one, markers = time.perf_counter(), GelSurface.at_rest(self.grid), None
         height, contact, centre = (np.repeat(v, len(envs), axis=0) for v in (one.height, one.contact, one.contact_centre))
         surface = GelSurface(self.grid, height, contact, centre)
         if self.markers is not None:
             markers = self.marker_tracker.at_rest(envs)
             surface = self._dotted(surface, markers)
         done = time.perf_counter()
-        return self._frame(surface, markers, done, {"surface": 1e3 * (done - start)})
+        return self._frame(surface, markers, done, {"surface": 1e3 * (done - began)})
 
     @property
     def marker_tracker(self) -> MarkerTracker:
@@ -425,3 +424,9 @@ class TactileSensor:
                 self.spec, resolution=self.resolution, outputs=self._optical_outputs, device=self.device, seed=self.seed
             )
         return mode
+
+
+def _by_name(images: Callable[[], OpticsImages]) -> dict[str, Any]:
+    """Fields of a frame from images that are waited for."""
+    known = images()
+    return {name: getattr(known, name, None) for name in IMAGES}

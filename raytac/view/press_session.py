@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import chain
@@ -128,9 +127,7 @@ class PressSession:
 
     def snapshot(self) -> Snapshot:
         if self._shot is None:
-            began = time.perf_counter()
-            frame = self._sensor.update(self._state)
-            self._shot = self._drawn(frame, 1e3 * (time.perf_counter() - began))
+            self._shot = self._drawn(self._sensor.update(self._state))
         return self._shot
 
     # --- controls --------------------------------------------------------------------------------------------------------------
@@ -205,8 +202,10 @@ class PressSession:
         vertices, faces = solver.scene.mesh(OBJECT, PAD)
         return vertices[0], faces
 
-    def _drawn(self, frame: TactileFrame, image_ms: float) -> Snapshot:
+    def _drawn(self, frame: TactileFrame) -> Snapshot:
         name, surface = self._sensor.spec.name, frame.surface
+        pads = {name: pad_view(frame, self._grid, np.eye(4))}
+        spent = frame.time_ms  # of a frame whose images were waited for
         poses = {solid.name: self._state.pad_from_object[0] for solid in self.solids if solid.name.startswith("object")}
         reshaped: dict[str, np.ndarray] = {}
         if isinstance(self._pad, SoftPad):
@@ -217,13 +216,13 @@ class PressSession:
                 reshaped["object"], poses["object"] = soft[0], np.eye(4)
         controls = {name: self._targets.get(name, value) for name, value in self._places().items()} if self._is_drivable else {}
         return Snapshot(
-            pads={name: pad_view(frame, self._grid, np.eye(4))},
+            pads=pads,
             poses=poses,
             reshaped=reshaped,
             controls=controls,
             facts=self._facts(frame),
             warning=narrow_warning(frame),
-            time_ms={"image": image_ms, **frame.time_ms},
+            time_ms={"image": sum(spent.values()), **spent},
         )
 
     def _facts(self, frame: TactileFrame) -> dict[str, str]:

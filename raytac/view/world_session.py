@@ -142,7 +142,8 @@ class WorldSession:
             bodies[body] = pose
         poses = {name: bodies[body] for name, body in self._body_of.items()}
         reshaped = {f"soft/{body.name}": self._world.mesh(body.name)[0][0] for body in self._soft}
-        time_ms = {"physics": self._physics_ms}
+        pads = {name: pad_view(f, self._grids[name], state.world_from_pad[name][0]) for name, f in frames.items()}
+        time_ms = {"physics": self._physics_ms}  # of frames whose images were waited for
         for name, frame in frames.items():
             poses[f"{name}_gel"] = poses[f"{name}_coat_mesh"] = state.world_from_pad[name][0]
             if frame.surface.coat is not None:
@@ -150,7 +151,7 @@ class WorldSession:
             for part, value in frame.time_ms.items():
                 time_ms[part] = time_ms.get(part, 0.0) + value
         return Snapshot(
-            pads={name: pad_view(f, self._grids[name], state.world_from_pad[name][0]) for name, f in frames.items()},
+            pads=pads,
             poses=poses,
             reshaped=reshaped,
             controls=self._steering.asked,

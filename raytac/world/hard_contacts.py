@@ -5,7 +5,7 @@ contact for a step and falls again, and what rests chatters. Here contacts are k
 asks for the speed at the end of a step by which a gap is just closed, v = −gap / Δt. A penetration is taken back by a tenth in a step, so
 that bodies do not bounce off it. Both hold for steps of any length.
 
-``write_references`` of ``mujoco_kernels`` sets it.
+``write_references`` of ``engine.c_kernels`` sets it.
 
 MuJoCo's convex cone lifts what slides by μ |v_t| Δt (M. Anitescu, Math. Program. 105, 2006): by 0.2 mm at 0.1 m/s, μ = 0.2 and 10 ms.
 """

@@ -13,7 +13,7 @@ from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.gel.surface import chosen_envs
 from raytac.world.environment_models import EnvironmentModels
-from raytac.world.rigid_pads import RigidPads
+from raytac.world.rigid_pads import pads_on_c_mujoco
 from raytac.world.sensor_frames import SensorFrames
 from raytac.world.world_model import checked_states, own_world_model
 from raytac.world.world_state import check_controls
@@ -79,9 +79,10 @@ class PadStepper:
         self.failed = np.zeros(num_envs, bool)
         self._frames = SensorFrames(self.composed.sensors, num_envs=num_envs, seed=settings.pop("seed", 0), **settings)
         self._models = EnvironmentModels(self.composed, num_envs)
-        self._pads = RigidPads(self.composed, self._models, [mujoco.MjData(model)] * num_envs)
+        self._pads, self._engine = pads_on_c_mujoco(self.composed, self._models, [mujoco.MjData(model)] * num_envs)
         self._time = np.full(num_envs, -np.inf)
-        self._put: Any = None
+        self._put: np.ndarray | None = None
+        self._counts: list[tuple[int, int]] = []
 
     def reset(self, envs: np.ndarray | list[int] | None = None) -> None:
         """Forget what the pads of states (a mask (B,), a list, or None for all) went through.
@@ -100,7 +101,7 @@ class PadStepper:
             InputError: another model, timestep or number of states, or a control that is not finite.
         """
         datas = self._states(model, data)
-        self._pads.advance(datas, lambda _: None, self.failed)
+        self._pads.advance(lambda _: None, self.failed)
         self._time[:] = [one.time for one in datas]
 
     def add(self, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData]) -> None:
@@ -111,10 +112,11 @@ class PadStepper:
         Raises:
             InputError: as ``step``, or no ``finish`` since the last ``add``.
         """
-        datas = self._states(model, data)
+        self._states(model, data)
         if self._put is not None:
             raise InputError("add", value="again", rule="must be followed by mj_step2 and finish before it is called again")
-        self._put = self._pads.add(datas, self.failed)
+        self._put = self._pads.add(self.failed)
+        self._counts = self._engine.counts(self._put)
 
     def finish(self, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData]) -> None:
         """Read the pads' forces and let the gels shear, after ``mj_step2``.
@@ -126,7 +128,11 @@ class PadStepper:
         if self._put is None:
             raise InputError("finish", value="without add", rule="must follow add and mj_step2")
         put, self._put = self._put, None
-        self._pads.finish(datas, put, self.failed)
+        self._engine.bind(datas)
+        if self._engine.counts(put) != self._counts:
+            rule = "must follow the mj_step2 after add: MuJoCo has other contacts now, and those of add are lost; call reset"
+            raise InputError("finish", value="after another mj_step1", rule=rule)
+        self._pads.finish(put, self.failed)
         self._time[:] = [one.time for one in datas]
 
     def wrench(self, name: str) -> np.ndarray:
@@ -146,9 +152,9 @@ class PadStepper:
         Raises:
             InputError: another number of states or an unknown sensor; as ``TactileSensor.update``.
         """
-        datas = checked_states(self.model, self.model, data, len(self.failed))
+        self._engine.bind(checked_states(self.model, self.model, data, len(self.failed)))
         return self._frames.observe(
-            lambda name, grid, rows: self._pads.reading(name, grid, datas, self.failed, rows), self.failed, sensors, None
+            lambda name, grid, rows: self._pads.reading(name, grid, self.failed, rows), self.failed, sensors, None
         )
 
     def _states(self, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData]) -> list[mujoco.MjData]:
@@ -160,4 +166,5 @@ class PadStepper:
         back = [b for b, one in enumerate(datas) if one.time < self._time[b]]
         if back:
             self.reset(back)
+        self._engine.bind(datas)
         return datas

@@ -13,11 +13,10 @@ from raytac.gel.pyramid import ElasticSurround
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.gel.traction import foundation_traction
 from raytac.physics.base import PadReading
+from raytac.physics.rigid.pierced import BondedFaces
 from raytac.physics.rigid.underside import Undersides
 from raytac.shapes.part import Part
-from raytac.shapes.underside import object_radius
 from raytac.specs.sensor import GelpadSpec
-from raytac.world.forbidden_overlap import BondedFace
 
 
 @dataclass(frozen=True)
@@ -35,8 +34,7 @@ class PadSurfaces:
     def __init__(self, gelpads: Mapping[str, GelpadSpec], bodies: Sequence[Sequence[Part]], num_envs: int) -> None:
         """``gelpads`` by the name of the sensor, ``bodies`` as the parts of each in its frame."""
         self._gelpads, self._bodies = dict(gelpads), tuple(bodies)
-        self._faces = {name: BondedFace(gelpad) for name, gelpad in gelpads.items()}
-        self._radius = np.array([object_radius(parts) for parts in bodies])
+        self._faces: dict[str, BondedFaces] = {}
         self._pressed = {name: np.full(num_envs, -1) for name in gelpads}
         """−1: none."""
         self._shown: dict[str, _Shown] = {}
@@ -77,9 +75,13 @@ class PadSurfaces:
         shown, count, gelpad = self._shown[name], len(pad_from_body), self._gelpads[name]
         under = shown.undersides.of(pad_from_body, ~failed)
         height, depth = under.height, under.depth
-        for row, i in np.argwhere(under.behind).tolist():
-            if self._faces[name].pierced(self._bodies[i], pad_from_body[row : row + 1, i], float(self._radius[i]))[0]:
-                height[row], depth[row, i] = np.nan, -np.inf
+        behind = np.flatnonzero(under.behind.any(axis=1))
+        if len(behind):
+            if name not in self._faces:
+                self._faces[name] = BondedFaces.on_cpu([self._gelpads[name]], self._bodies)
+            pierced = self._faces[name].pierced(pad_from_body[behind, None])[:, 0] & under.behind[behind]
+            for k, i in np.argwhere(pierced).tolist():
+                height[behind[k]], depth[behind[k], i] = np.nan, -np.inf
         poses, pressed = np.full((count, 4, 4), np.nan), np.full(count, -1)
         if self._bodies:
             deepest = depth.argmax(axis=1)

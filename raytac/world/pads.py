@@ -13,14 +13,12 @@ from raytac.registry import Registry
 from raytac.world.world_state import Drive
 
 if TYPE_CHECKING:
-    import mujoco
-
     from raytac.physics.soft.scene import SoftScene
 
 WORLD_PADS: Registry[Any] = Registry(
-    "physics", {"rigid": "raytac.world.rigid_pads:RigidPads", "ipc": "raytac.world.soft_pads:SoftPads"}
+    "physics", {"rigid": "raytac.world.rigid_pads:rigid_pads", "ipc": "raytac.world.soft_pads:SoftPads"}
 )
-"""Classes of world pads, called with ``(composed, models, datas, *, physics, coupling, device)``; ``physics`` is the configuration."""
+"""Maker of world pads, called with ``(composed, models, datas, *, physics, coupling, device)``; ``physics`` is the configuration."""
 
 
 class WorldPads(Protocol):
@@ -39,12 +37,11 @@ class WorldPads(Protocol):
         """Names of all that ``soft`` has a surface of."""
         ...
 
-    def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData], bodies: Mapping[str, np.ndarray] | None = None) -> None:
-        """Put environments back to the start.
+    def reset(self, envs: Sequence[int], bodies: Mapping[str, np.ndarray] | None = None) -> None:
+        """Put environments back to the start, where MuJoCo's states are.
 
         Args:
             envs: the environments.
-            datas: MuJoCo's states of all environments, at the start.
             bodies: not None if bodies or the robot start elsewhere: name to poses (n, 4, 4).
 
         Raises:
@@ -52,7 +49,7 @@ class WorldPads(Protocol):
         """
         ...
 
-    def advance(self, datas: Sequence[mujoco.MjData], drive: Drive, failed: np.ndarray) -> None:
+    def advance(self, drive: Drive, failed: np.ndarray) -> None:
         """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still."""
         ...
 
@@ -60,12 +57,10 @@ class WorldPads(Protocol):
         """Wrench (B, 6) of what touches a pad, about its origin, pad frame."""
         ...
 
-    def reading(
-        self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray, envs: Sequence[int] | None = None
-    ) -> PadReading:
+    def reading(self, name: str, grid: PadGrid, failed: np.ndarray, envs: Sequence[int] | None = None) -> PadReading:
         """Surface and forces of one sensor on the nodes of ``grid``, for the environments named, one row each; None is all."""
         ...
 
-    def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:
-        """Sensor, body and depth [m] of every overlap at the present poses."""
+    def overlap(self, env: int) -> list[tuple[str, str, float]]:
+        """Sensor, body and depth [m] of every overlap at the present poses of an environment."""
         ...

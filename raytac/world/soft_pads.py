@@ -70,7 +70,7 @@ class SoftPads:
             SpecError: a body that the solver cannot hold, or with two-way coupling a held soft one with too many cells.
             OverlapError: bodies overlap at the start, or one of the solver's lies inside a case or a link.
         """
-        self.composed, self.model, self._models = composed, composed.model, models
+        self.composed, self.model, self._models, self._datas = composed, composed.model, models, tuple(datas)
         assert composed.scene is not None, "a world of one's own has rigid pads"
         self._scene, level = composed.scene, physics.level or PADS[0]
         scene = self._scene
@@ -115,7 +115,7 @@ class SoftPads:
         """Steps of the solver since the reset that did not meet its tolerance."""
         self.report: dict[str, np.ndarray] = {}
 
-    def reset(self, envs: Sequence[int], datas: Sequence[mujoco.MjData], bodies: Mapping[str, np.ndarray] | None = None) -> None:
+    def reset(self, envs: Sequence[int], bodies: Mapping[str, np.ndarray] | None = None) -> None:
         """Put environments back to the start: gels at rest, no forces, bodies where they began.
 
         ``bodies``: not None if they or the robot start elsewhere: name to poses (n, 4, 4) of the environments named; the cases are where
@@ -124,6 +124,7 @@ class SoftPads:
         Raises:
             OverlapError: bodies overlap there; the solver has not changed then, what MuJoCo shows of its bodies has.
         """
+        datas = self._datas
         cases, chosen = self._pad_poses(datas), list(envs)
         begin = {b.name: pose_of(b.position, b.quaternion) for b in self._scene.bodies}
         starts = {name: np.repeat(at[None], len(datas), axis=0) for name, at in begin.items()}
@@ -149,7 +150,7 @@ class SoftPads:
                 self._coupling.reset(b, datas[b])
             self._mirror(datas, [b])
 
-    def advance(self, datas: Sequence[mujoco.MjData], drive: Drive, failed: np.ndarray) -> None:
+    def advance(self, drive: Drive, failed: np.ndarray) -> None:
         """Take one control step of all environments; those that fail are marked in ``failed`` (B,) and stand still.
 
         An environment fails if its state is not finite, if its last step did not meet the solver's tolerance, or, with a
@@ -158,7 +159,7 @@ class SoftPads:
         Raises:
             InputError: the only environment moves too fast; it has failed then, until it is reset.
         """
-        scene, timestep = self._scene, self.composed.timestep
+        scene, timestep, datas = self._scene, self.composed.timestep, self._datas
         interval, since, reports = round(scene.soft_timestep / timestep), 0, []
         steps = round(scene.control_timestep / timestep)
         for step in range(1, steps + 1):
@@ -194,9 +195,7 @@ class SoftPads:
         """Wrench (B, 6) of all contacts on a pad, about its origin, pad frame."""
         return self._wrench[name].copy()
 
-    def reading(
-        self, name: str, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray, envs: Sequence[int] | None = None
-    ) -> PadReading:
+    def reading(self, name: str, grid: PadGrid, failed: np.ndarray, envs: Sequence[int] | None = None) -> PadReading:
         """Surface and forces of one sensor, for the environments named, one row each; None is all."""
         left_out = failed if envs is None else failed | ~np.isin(np.arange(len(failed)), envs)
         reading = self.soft.reading(name, grid, left_out)
@@ -211,7 +210,7 @@ class SoftPads:
         result = PadReading(reading.surface, wrench, failed, traction, unconverged=self._unconverged.copy())
         return result if envs is None else result.of(envs)
 
-    def overlap(self, data: mujoco.MjData) -> list[tuple[str, str, float]]:
+    def overlap(self, env: int) -> list[tuple[str, str, float]]:
         """Overlaps at the start: an empty list, since the solver raises an error for them."""
         return []
 

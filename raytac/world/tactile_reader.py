@@ -13,11 +13,11 @@ from raytac.frame import TactileFrame
 from raytac.gel.surface import chosen_envs
 from raytac.physics.base import PadReading
 from raytac.physics.rigid.contacts import LoadTables
+from raytac.physics.rigid.pierced import BondedFaces
 from raytac.physics.rigid.search import PadSearch
 from raytac.robots.frames import body_poses, site_poses
 from raytac.robots.mount import MountedSensor
 from raytac.se3 import inverse
-from raytac.world.forbidden_overlap import BondedFaces
 from raytac.world.pad_surfaces import PadSurfaces
 from raytac.world.sensor_frames import SensorFrames
 from raytac.world.world_model import checked_states, own_world_model
@@ -91,7 +91,7 @@ class TactileReader:
         self._frames = SensorFrames(sensors_, num_envs=num_envs, seed=settings.pop("seed", 0), **settings)
         shapes = [body.parts for body in bodies]
         self._surfaces = PadSurfaces({mounted.name: mounted.spec.gelpad for mounted in sensors_}, shapes, num_envs)
-        self._faces = {mounted.name: BondedFaces([mounted.spec.gelpad], shapes) for mounted in sensors_}
+        self._faces = {mounted.name: BondedFaces.on_cpu([mounted.spec.gelpad], shapes) for mounted in sensors_}
         self._body_index = np.array([body.index for body in bodies], int)
         # Entries of one body move together: MuJoCo's force is on the body.
         self._groups = {int(index): np.flatnonzero(self._body_index == index) for index in np.unique(self._body_index)}

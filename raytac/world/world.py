@@ -64,7 +64,7 @@ class TactileWorld:
     Attributes:
         scene: the task scene; None of a model of one's own.
         physics: configuration that is used.
-        model, data: MuJoCo's model of the scene, and its state in every environment.
+        model: MuJoCo's model of the scene.
         models: the model of every environment: the scene's own, or another one after a ``reset`` with a variation.
         arm: the joints that move the robot's site; None without joints.
         composed: names and indices of the scene's parts in the model.
@@ -169,7 +169,7 @@ class TactileWorld:
             pitch=pitch,
         )
         self.model = self.composed.model
-        self.data = tuple(mujoco.MjData(self.model) for _ in range(num_envs))
+        self._data = tuple(mujoco.MjData(self.model) for _ in range(num_envs))
         self.models = EnvironmentModels(self.composed, num_envs)
         self.arm: Arm | None = self.composed.arm
         self._reader = StateReader(self.data, self._numbers())
@@ -179,6 +179,8 @@ class TactileWorld:
             others = np.setdiff1d(np.arange(self.model.nu), self.arm.motors)
             self._holding = self._law.springs(self.data, others.tolist())
             self._holding.aim(self.composed.start[self.arm.qpos], np.zeros(1), np.zeros(1), self.composed.ctrl[others])
+        self._spares: list[mujoco.MjData] = []
+        """States in which a reset keeps those that it may have to put back."""
         self._failed, self._stepped = np.zeros(num_envs, bool), Lock()
         self._start_over(range(num_envs))
         self._pads: WorldPads = WORLD_PADS.config_class(name)(
@@ -203,6 +205,11 @@ class TactileWorld:
 
     def close(self) -> None:
         """Do nothing, any number of times: memory and kernels go with the last reference, and no file, thread or window is held."""
+
+    @property
+    def data(self) -> tuple[mujoco.MjData, ...]:
+        """MuJoCo's state in every environment."""
+        return self._data
 
     @property
     def sensors(self) -> dict[str, TactileSensor]:
@@ -263,7 +270,7 @@ class TactileWorld:
             self.models.check(variation, len(chosen), rigid=not self.physics.is_simulated)
         if joints is None and not starts and variation is None and not self.models.differ(chosen):
             self._start_over(chosen)
-            self._pads.reset(chosen, self.data)
+            self._pads.reset(chosen)
         else:
             self._start_elsewhere(chosen, joints, starts, variation)
         self._frames.reset(chosen)
@@ -273,12 +280,17 @@ class TactileWorld:
         self, envs: Sequence[int], joints: np.ndarray | None, bodies: Mapping[str, np.ndarray], variation: Variation | None
     ) -> None:
         """Reset to given starts or models; nothing changes if bodies overlap there."""
-        before, failed, models = [copy(self.data[b]) for b in envs], self._failed.copy(), self.models.snapshot()
+        failed, models = self._failed.copy(), self.models.snapshot()
+        # A state takes longer to make than to copy.
+        self._spares += [mujoco.MjData(self.model) for _ in range(len(envs) - len(self._spares))]
+        before = self._spares[: len(envs)]
+        for b, spare in zip(envs, before, strict=True):
+            mujoco.mj_copyData(spare, self.model, self.data[b])
         if variation is not None:
             self.models.vary(envs, variation)
         self._start_over(envs, joints, bodies)
         try:
-            self._pads.reset(envs, self.data, bodies)
+            self._pads.reset(envs, bodies)
         except OverlapError:
             self.models.restore(models)
             for b, data in zip(envs, before, strict=True):
@@ -340,7 +352,7 @@ class TactileWorld:
             rule = "must be stepped by one thread at a time; each thread may have a world of its own"
             raise InputError("world", value="stepped by another thread", rule=rule)
         try:
-            self._pads.advance(self.data, drive, self._failed)
+            self._pads.advance(drive, self._failed)
         finally:
             self._stepped.release()
         return self.state()
@@ -391,7 +403,7 @@ class TactileWorld:
             InputError: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
         """
         return self._frames.observe(
-            lambda name, grid, rows: self._pads.reading(name, grid, self.data, self._failed, rows), self._failed, sensors, envs
+            lambda name, grid, rows: self._pads.reading(name, grid, self._failed, rows), self._failed, sensors, envs
         )
 
     def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -464,7 +476,7 @@ class TactileWorld:
                 names = [model.body(int(model.geom_bodyid[g])).name or "world" for g in contact.geom]
                 rule = f"overlap by {-contact.dist * 1e3:.3g} mm at the start: move one of them in the scene"
                 raise InputError("bodies", value=tuple(names), rule=rule)
-        for sensor, body, depth in self._pads.overlap(data):
+        for sensor, body, depth in self._pads.overlap(0):
             if depth > (_OVERLAP if self.scene is not None else np.inf) or np.isinf(depth):
                 rule = f"must not be pressed into the pad of {sensor!r} at the start; it is, by {depth * 1e3:.3g} mm"
                 if np.isinf(depth):

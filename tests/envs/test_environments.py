@@ -14,11 +14,12 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 import raytac.envs
-import raytac.envs.lift_cube
 from raytac.envs import (
     BalancePoleEnv,
+    InsertPegEnv,
     LiftCubeEnv,
     LiftCubeVectorEnv,
+    OpenDrawerEnv,
     PushCubeEnv,
     PushCubeVectorEnv,
     RollBallEnv,
@@ -27,14 +28,18 @@ from raytac.envs import (
 )
 from raytac.envs.balance_pole import BalancePole
 from raytac.envs.batch import TaskBatch
+from raytac.envs.insert_peg import SOCKET, InsertPeg
+from raytac.envs.lift_cube import LiftCube
+from raytac.envs.open_drawer import OpenDrawer
 from raytac.envs.push_cube import PushCube
 from raytac.envs.roll_ball import RollBall
+from raytac.envs.task_rules import TaskState
 from raytac.errors import InputError
 from raytac.markers import MarkerPerturbation
 from raytac.observe import ObservationSettings, Randomization
 from raytac.optics import RayTraced
 
-ENVS = (PushCubeEnv, BalancePoleEnv, LiftCubeEnv, RollBallEnv)
+ENVS = (PushCubeEnv, BalancePoleEnv, LiftCubeEnv, RollBallEnv, InsertPegEnv, OpenDrawerEnv)
 
 
 def equal(a: dict, b: dict) -> bool:
@@ -55,9 +60,9 @@ def test_gymnasium_and_stable_baselines3_accept_it(kind: type) -> None:
 
 def test_every_name_is_registered_alone_and_as_a_vector() -> None:
     assert tuple(i for i in gymnasium.registry if i.startswith("raytac/")) == raytac.envs.IDS
-    env = gymnasium.make("raytac/RollBall-v0", tactile=None)
+    env = gymnasium.make("raytac/RollBall-v1", tactile=None)
     assert isinstance(env.unwrapped, RollBallEnv) and "sensor_markers" not in env.observation_space.spaces  # type: ignore[attr-defined]
-    many = gymnasium.make_vec("raytac/RollBall-v0", num_envs=3, vectorization_mode="vector_entry_point", tactile=None)
+    many = gymnasium.make_vec("raytac/RollBall-v1", num_envs=3, vectorization_mode="vector_entry_point", tactile=None)
     assert isinstance(many.unwrapped, RollBallVectorEnv) and many.num_envs == 3
 
 
@@ -244,6 +249,33 @@ def test_the_shipped_policies_read_public_names_only() -> None:
     assert not re.findall(r"\w\._\w+", inspect.getsource(scripted))
 
 
+def test_an_older_version_is_refused_with_the_name_of_the_present_one() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with pytest.raises(gymnasium.error.DeprecatedEnv, match="raytac/LiftCube-v1"):
+            gymnasium.make("raytac/LiftCube-v0")
+
+
+def test_a_held_cube_is_worth_more_the_higher_it_is_and_a_loose_one_nothing() -> None:
+    height = np.array([0.0151, 0.02, 0.03, 0.04, 0.08, 0.08])
+    rows = len(height)
+    poses = np.tile(np.eye(4), (rows, 1, 1))
+    poses[:, 2, 3] = height
+    wrench = np.zeros((rows, 6))
+    wrench[:-1, 2] = -1.0  # of the last, only one pad is pressed
+    state = TaskState(
+        tool=poses, speed=np.zeros((rows, 3)), body=poses, body_speed=np.zeros((rows, 6)),
+        goal=np.full((rows, 3), [0.0, 0.0, 0.08]), wrench={"left": wrench, "right": np.tile([0.0, 0, -1, 0, 0, 0], (rows, 1))},
+        joint_speed=np.zeros((rows, 7)), action=np.zeros((rows, 4)), last_action=np.zeros((rows, 4)),
+    )  # fmt: skip
+    terms = LiftCube().evaluate(state).terms
+    rise = np.clip((height - 0.0155) / 0.0245, 0, 1) * [1, 1, 1, 1, 1, 0]
+    np.testing.assert_allclose(terms["lifted"], 15 * rise)
+    np.testing.assert_allclose(terms["goal"], 16 * rise * (1 - np.tanh((0.08 - height) / 0.3)))
+    assert terms["held"].tolist() == [2, 2, 2, 2, 2, 0] and (np.diff(terms["lifted"][:4]) > 0).all() and terms["lifted"][0] == 0
+    assert LiftCube().evaluate(state).success.tolist() == [False] * 4 + [True] * 2
+
+
 def test_a_pole_that_is_left_alone_falls_and_the_episode_ends() -> None:
     batch = TaskBatch(BalancePole(), num_envs=4, tactile=None)
     batch.reset(range(4), [np.random.default_rng(b) for b in range(4)])
@@ -259,7 +291,13 @@ def test_a_pole_that_is_left_alone_falls_and_the_episode_ends() -> None:
 
 
 @pytest.mark.parametrize(
-    ("task", "policy", "steps"), [(RollBall, scripted.roll_ball, 60), (BalancePole, scripted.balance_pole, 120)]
+    ("task", "policy", "steps"),
+    [
+        (RollBall, scripted.roll_ball, 60),
+        (BalancePole, scripted.balance_pole, 120),
+        (InsertPeg, scripted.insert_peg, 180),
+        (OpenDrawer, scripted.open_drawer, 120),
+    ],
 )
 def test_the_task_can_be_done(task: type, policy, steps: int) -> None:
     batch = TaskBatch(task(), num_envs=2, tactile=None)
@@ -270,10 +308,22 @@ def test_the_task_can_be_done(task: type, policy, steps: int) -> None:
     assert out.success.all()
 
 
+def test_a_peg_beside_its_socket_stays_outside_and_the_gels_feel_the_rim(monkeypatch: pytest.MonkeyPatch) -> None:
+    batch = TaskBatch(InsertPeg(), num_envs=2, tactile=None)
+    batch.reset([0, 1], [np.random.default_rng(b) for b in range(2)])
+    monkeypatch.setattr(scripted, "SOCKET", np.add(SOCKET, [1e-3, 0.0]))
+    upward, overlap = np.zeros(2), 0.0
+    for _ in range(150):
+        out = batch.step(scripted.insert_peg(batch))
+        wrench = batch.world.state().wrench
+        upward = np.maximum(upward, -(wrench["left"] + wrench["right"])[:, 1])  # y of both pads is down
+        overlap = max(overlap, *(-data.contact.dist.min(initial=0.0) for data in batch.world.data))
+        assert not out.success.any() and not out.failed.any()
+    assert (upward > 5.0).all() and overlap < 2e-4
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("task", "policy"), [(PushCube, scripted.push_cube), (raytac.envs.lift_cube.LiftCube, scripted.lift_cube)]
-)
+@pytest.mark.parametrize(("task", "policy"), [(PushCube, scripted.push_cube), (LiftCube, scripted.lift_cube)])
 def test_the_long_tasks_can_be_done(task: type, policy) -> None:
     batch = TaskBatch(task(), num_envs=2, tactile=None)
     batch.reset([0, 1], [np.random.default_rng(b) for b in range(2)])

@@ -6,6 +6,7 @@ Dr.Jit records the kernels of a first frame and replays them for the next, so a 
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -99,7 +100,7 @@ OTHER = ball(GRID, depth=0.4e-3, centre=(-2e-3, 1e-3))
 
 def arrays(mode: Any, surface: GelSurface) -> dict[str, np.ndarray]:
     """Images of ``render``, which shows untouched pads as they were once; those of a frame that renders every pad must be the same."""
-    lazy, every = (by_name(images) for images in (mode.render(surface), mode._rendered(surface, *mode._checked(surface))))
+    lazy, every = (by_name(images) for images in (mode.render(surface), mode._begun(surface, *mode._checked(surface))()))
     assert_same(lazy, every, "render against a frame of all pads")
     return every
 
@@ -328,15 +329,56 @@ def test_other_numbers_of_markers_are_other_recordings(device: str) -> None:
 @EACH_MODE
 def test_only_pressed_pads_are_rendered(mode: str, monkeypatch: pytest.MonkeyPatch) -> None:
     one, rendered = MODES[mode]("cpu"), []
-    whole = type(one)._rendered
+    whole = type(one)._begun
 
-    def counted(self: Any, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> OpticsImages:
+    def counted(self: Any, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> Callable[[], OpticsImages]:
         rendered.append(len(heights))
         return whole(self, surface, heights, failed)
 
-    monkeypatch.setattr(type(one), "_rendered", counted)
+    monkeypatch.setattr(type(one), "_begun", counted)
     for batch in ((REST, REST, REST, REST), (REST, PRESS, REST, REST), (REST, REST, REST, REST)):
         one.render(stacked(*batch))
     assert rendered == [1, 1]  # the pad at rest once, and the one that is pressed
     one.render(stacked(PRESS, REST, PRESS, PRESS))
     assert rendered == [1, 1, 4]  # three are rounded up, so that few sizes are recorded
+
+
+@EACH_MODE
+def test_images_that_are_read_late_are_those_of_their_own_surface(mode: str) -> None:
+    one, surfaces = MODES[mode]("cpu"), [stacked(pad) for pad in (PRESS, REST, OTHER, PRESS)]
+    expected = [by_name(MODES[mode]("cpu").render(surface)) for surface in surfaces]
+    begun = [one.start(surface) for surface in surfaces]
+    for k in (2, 0, 3, 1):
+        assert_same(by_name(begun[k]()), expected[k], f"surface {k}, read late")
+
+
+@EACH_MODE
+def test_another_thread_reads_the_same_images(mode: str) -> None:
+    one = MODES[mode]("cpu")
+    expected, read = by_name(one.render(stacked(PRESS))), []
+    for _ in range(5):
+        begun = one.start(stacked(PRESS))
+        thread = threading.Thread(target=lambda begun=begun: read.append(by_name(begun())))
+        thread.start()
+        thread.join()
+    assert len(read) == 5
+    for images in read:
+        assert_same(images, expected, "read in another thread")
+
+
+@EACH_MODE
+@pytest.mark.parametrize("in_thread", [False, True])
+def test_arrays_may_be_written_to_before_the_images_are_read(mode: str, in_thread: bool) -> None:
+    one, read = MODES[mode]("cpu"), []
+    expected, surface = by_name(one.render(stacked(PRESS, ink=True))), stacked(PRESS, ink=True)
+    begun = one.start(surface)
+    surface.height[:], surface.contact[:] = GRID.rest, False
+    assert surface.ink is not None
+    surface.ink[:] = 0.0
+    if in_thread:
+        thread = threading.Thread(target=lambda: read.append(by_name(begun())))
+        thread.start()
+        thread.join()
+    else:
+        read.append(by_name(begun()))
+    assert_same(read[0], expected, "arrays written to after the call")

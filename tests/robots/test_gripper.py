@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from raytac.robots.gripper import GripperSettings, floating_gripper
+from raytac.robots.panda import two_finger_panda
 
 
 def lifted(position: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -43,3 +44,20 @@ def test_mechanics_are_settings() -> None:
     assert (
         opening.ctrlrange.tolist() == [0.0, 0.06] and opening.forcerange.tolist() == [-50.0, 50.0] and opening.gainprm[0] == 2e4
     )
+
+
+@pytest.mark.parametrize("make", [floating_gripper, two_finger_panda])
+def test_an_opening_that_is_driven_at_10_ms_follows_its_target(make) -> None:
+    robot = make("gelsight_mini")
+    robot.spec.option.timestep, robot.spec.option.integrator = 0.01, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    robot.spec.option.gravity = (0.0, 0.0, 0.0)
+    model = robot.spec.compile()
+    data, opening = mujoco.MjData(model), model.actuator(robot.opening).id
+    fastest = 0.0
+    for target in (0.05, 0.02, 0.08, 0.049):
+        data.ctrl[opening] = target
+        for _ in range(100):
+            mujoco.mj_step(model, data)
+            fastest = max(fastest, abs(float(data.actuator_velocity[opening])))
+        assert data.actuator_length[opening] == pytest.approx(target, abs=2e-4)
+    assert fastest < 1.0  # the bound of force, 70 N, over the damping, 100 N s/m, and what the step adds

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -237,3 +238,9 @@ def test_a_soft_object_is_drawn_as_it_deforms():
     assert ball.shape == solid.vertices.shape and (shot.poses["object"] == np.eye(4)).all()
     flattened = np.ptp(ball[:, 2]) - np.ptp(solid.vertices[:, 2])
     assert -0.3e-3 < flattened < -0.05e-3  # the gel is as soft as the ball, and both give way
+
+
+def test_times_include_the_wait_for_images(rigid):
+    frame = rigid._sensor.update(rigid._state).with_values(images=lambda: time.sleep(0.05) or {})
+    spent = rigid._drawn(frame).time_ms
+    assert spent["optics"] >= 50.0 and spent["image"] >= spent["surface"] + spent["optics"]

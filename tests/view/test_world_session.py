@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -152,3 +153,9 @@ def test_soft_pads_and_soft_bodies_are_drawn_as_they_deform():
     assert edges.shape == first.reshaped["left_coat_mesh"].shape and (edges != first.reshaped["left_coat_mesh"]).any()
     assert shot.pads["left"].values["indentation"].max() > 2e-5
     assert float(shot.facts["least gap"].split()[0]) > 0.0
+
+
+def test_times_include_the_wait_for_images():
+    view = session(UP)
+    frames = {name: f.with_values(images=lambda: time.sleep(0.05) or {}) for name, f in view._world.observe().items()}
+    assert view._drawn(frames).time_ms["optics"] >= 50.0

@@ -12,12 +12,11 @@ from raytac.envs.batch import TaskBatch
 from raytac.envs.push_cube import PushCube
 from raytac.errors import InputError, OverlapError
 from raytac.physics.objects import object_parts
+from raytac.physics.rigid.pierced import BondedFaces
 from raytac.robots.mount import case_depth
 from raytac.se3 import rotations
 from raytac.shapes.part import mesh_part, primitive
-from raytac.shapes.underside import object_radius
 from raytac.specs import BodySpec, RobotSpec, TaskScene, load_sensor
-from raytac.world.forbidden_overlap import BondedFace
 from raytac.world.world import TactileWorld
 
 MINI = load_sensor("gelsight_mini")
@@ -83,16 +82,13 @@ def test_a_slow_body_is_carried_at_the_same_step() -> None:
 
 def test_a_skew_path_counts_where_it_crosses_the_gel() -> None:
     """In one step from beside the pad to behind it: once through the gel's face, once past the case's edge."""
-    face, half, radius = BondedFace(MINI.gelpad), 0.5 * MINI.gelpad.size[0], float(SHAPES["grain"].params["radius"])
-    parts = object_parts(SHAPES["grain"])
+    faces, half = BondedFaces.on_cpu([MINI.gelpad], [object_parts(SHAPES["grain"])]), 0.5 * MINI.gelpad.size[0]
     for beside, move, crosses in ((half + 0.01, [-0.03, 0.0, -0.06], True), (half + 0.025, [-0.01, 0.0, -0.08], False)):
-        before, after = np.tile(np.eye(4), (2, 1, 1, 1))
-        before[0, :3, 3] = beside, 0.0, 0.02
-        after[0, :3, 3] = before[0, :3, 3] + move
-        pieces = int(face.pieces(before, after, radius)[0])
-        path = face.poses_between(before[0], after[0], pieces)
-        assert face.pierced(parts, path, radius).any() == crosses
-        assert not face.pierced(parts, np.concatenate([before, after]), radius).any()
+        before, after = np.tile(np.eye(4), (2, 1, 1, 1, 1, 1))
+        before[..., :3, 3] = beside, 0.0, 0.02
+        after[..., :3, 3] = before[..., :3, 3] + move
+        assert faces.pierced(after, before).item() == crosses
+        assert not faces.pierced(before).any() and not faces.pierced(after).any()
 
 
 def test_what_lies_behind_the_sensor_neither_presses_nor_fails() -> None:
@@ -164,7 +160,7 @@ def test_pierced_is_a_point_of_the_body_below_the_face_and_in_front_of_the_case(
         mesh = trimesh.creation.box(extents=2.0 * np.array(size))
         part = mesh_part(mesh.vertices, mesh.faces)
     poses = faces(80, rng)
-    found = BondedFace(MINI.gelpad).pierced([part], poses, object_radius([part]))
+    found = BondedFaces.on_cpu([MINI.gelpad], [[part]]).pierced(poses[:, None, None])[:, 0, 0]
 
     def share(margin: float) -> np.ndarray:
         """Of the points in the region grown by a margin [m]."""

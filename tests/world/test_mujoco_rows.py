@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from raytac.errors import BackendError
+from raytac.robots import mujoco_memory
 from raytac.robots.frames import body_poses, site_poses
 from raytac.specs import BodySpec, RobotSpec, TaskScene, load_task
-from raytac.world import mujoco_memory
+from raytac.world.engine.c_mujoco import CMujoco
 from raytac.world.hard_contacts import is_hard
+from raytac.world.pad_contact import PadIndices
 from raytac.world.rigid_pads import RigidPads
 from raytac.world.world import TactileWorld
 
@@ -38,9 +40,10 @@ def pressed(num_envs: int = 3) -> TactileWorld:
 def half_a_step(world: TactileWorld) -> RigidPads:
     """Up to between MuJoCo's two halves."""
     pads, envs = pads_of(world), np.arange(world.num_envs)
-    pads._bind(world.data)
-    pads._mujoco.first_half(envs.tolist())
-    pads._insert(envs, 0)
+    pads.engine.prepare()
+    pads.contact.choose(envs, 0)
+    pads.engine.begin_step()
+    pads._insert()
     return pads
 
 
@@ -49,15 +52,16 @@ def test_frames_and_velocities_are_mujocos() -> None:
     for b, data in enumerate(world.data):
         data.qvel[:] = np.random.default_rng(b).normal(0.0, 1.0, data.qvel.shape)
     pads = half_a_step(world)
-    frames = {name: getattr(pads._contact.frames, name).numpy() for name in ("place", "turn", "velocity", "spin")}
-    model, site = world.model, int(pads._site_index[0])
-    poses = [site_poses(world.data, site), *(body_poses(world.data, int(i)) for i in pads._body_index)]
+    frames = {name: getattr(pads.contact.frames, name).numpy() for name in ("place", "turn", "velocity", "spin")}
+    model, at = world.model, PadIndices.of(world.composed)
+    site = int(at.sites[0])
+    poses = [site_poses(world.data, site), *(body_poses(world.data, int(i)) for i in at.bodies)]
     for k, pose in enumerate(poses):
         np.testing.assert_array_equal(frames["place"][:, k], pose[:, :3, 3])
         np.testing.assert_array_equal(frames["turn"][:, k], pose[:, :3, :3])
     twist = np.zeros(6)
     for b, data in enumerate(world.data):
-        objects = [(mujoco.mjtObj.mjOBJ_SITE, site), *((mujoco.mjtObj.mjOBJ_XBODY, int(i)) for i in pads._body_index)]
+        objects = [(mujoco.mjtObj.mjOBJ_SITE, site), *((mujoco.mjtObj.mjOBJ_XBODY, int(i)) for i in at.bodies)]
         for k, (kind, index) in enumerate(objects):
             mujoco.mj_objectVelocity(model, data, kind, index, twist, 0)
             np.testing.assert_allclose(frames["spin"][b, k], twist[:3], atol=1e-12)
@@ -71,11 +75,12 @@ def test_free_accelerations_are_those_of_mujoco_without_constraints() -> None:
         data.qvel[:], data.ctrl[:] = rng.normal(0.0, 1.0, data.qvel.shape), rng.normal(0.0, 5.0, data.ctrl.shape)
         data.xfrc_applied[:] = rng.normal(0.0, 1.0, data.xfrc_applied.shape)
     pads = half_a_step(world)
-    push, swing = (getattr(pads._contact.frames, name).numpy() for name in ("push", "swing"))
-    model, bodies = world.model, [int(pads._pad_index[0]), *pads._body_index.tolist()]
+    push, swing = (getattr(pads.contact.frames, name).numpy() for name in ("push", "swing"))
+    at = PadIndices.of(world.composed)
+    model, bodies = world.model, [int(at.carriers[0]), *at.bodies.tolist()]
     for b, data in enumerate(world.data):
         mujoco.mj_forward(model, data)
-        places = [data.site_xpos[int(pads._site_index[0])], *(data.xpos[body] for body in bodies[1:])]
+        places = [data.site_xpos[int(at.sites[0])], *(data.xpos[body] for body in bodies[1:])]
         for k, (body, place) in enumerate(zip(bodies, places, strict=True)):
             linear, angular = np.zeros((2, 3, model.nv))
             mujoco.mj_jac(model, data, linear, angular, place, body)
@@ -91,12 +96,11 @@ def test_rows_are_written_where_mujoco_keeps_them_and_their_forces_are_read_ther
     for _ in range(4):
         world.step()
     pads = half_a_step(world)
-    slots, contact = pads._contact.slots, pads._contact
-    assert contact.views is not None
-    steps = contact.views.length.copy()
+    slots, contact = pads.contact.slots, pads.contact
+    steps = contact.steps.length.numpy().copy()
     for b, data in enumerate(world.data):
         held = np.argwhere(slots.held.numpy()[b])
-        assert len(held) == contact.views.contacts[b] == 2
+        assert len(held) == contact.steps.contacts.numpy()[b] == 2
         for k, (pad, body) in enumerate(held.tolist()):
             one, rows = data.contact[data.ncon - 2 + k], slice(data.nefc - 12 + 6 * k, data.nefc - 6 + 6 * k)
             assert one.efc_address == rows.start and one.dim == 6
@@ -111,8 +115,8 @@ def test_rows_are_written_where_mujoco_keeps_them_and_their_forces_are_read_ther
             assert one.mu == pytest.approx(one.friction[0] * np.sqrt(inverse[1] / inverse[0]), rel=1e-14)
             wanted = force * inverse - data.efc_vel[rows] / steps[b]
             np.testing.assert_allclose(data.efc_aref[rows], wanted, rtol=1e-13, atol=1e-13 * np.abs(wanted).max())
-    pads._mujoco.second_half(range(3), world.composed.timestep)
-    pads._finish(np.arange(3), world._failed)
+    pads.engine.end_step()
+    pads.finish(np.arange(3), world._failed)
     for b, data in enumerate(world.data):
         moved = np.zeros(data.nefc)
         mujoco.mj_mulJacVec(world.model, data, moved, data.qvel)
@@ -128,9 +132,8 @@ def test_hard_contacts_close_their_gaps_in_a_step_and_take_a_penetration_back_sl
         data.qpos[cube + 2] += [-0.5e-3, 0.5e-3, 1e-3][b]
         data.qvel[world.model.nv - 6 :] = 0.1 * (b + 1)
     pads, hard = half_a_step(world), is_hard(world.model)
-    assert pads._contact.views is not None
     some = 0
-    for data, step in zip(world.data, pads._contact.views.length, strict=True):
+    for data, step in zip(world.data, pads.contact.steps.length.numpy(), strict=True):
         for one in data.contact[: data.ncon]:
             if not hard[one.geom].any():
                 continue
@@ -142,16 +145,21 @@ def test_hard_contacts_close_their_gaps_in_a_step_and_take_a_penetration_back_sl
 
 
 def test_states_may_be_replaced_by_others() -> None:
-    """The kernels follow the states that they are given."""
+    """The kernels follow the states that the engine is bound to; those of a world stay its own."""
     world, other = pressed(2), pressed(2)
+    engine, datas = pads_of(other).engine, other.data
+    assert isinstance(engine, CMujoco)
     for _ in range(3):
-        before, other.data = other.data, tuple(copy(data) for data in other.data)
+        before, datas = datas, tuple(copy(data) for data in datas)
         for data in before:
             data.qpos[:] = data.xpos[:] = data.cvel[:] = np.nan
+        engine.bind(datas)
         world.step()
         other.step()
-    for one, two in zip(world.data, other.data, strict=True):
+    for one, two in zip(world.data, datas, strict=True):
         np.testing.assert_array_equal(one.qpos, two.qpos)
+    with pytest.raises(AttributeError):
+        world.data = datas  # type: ignore[misc]
 
 
 def test_a_mujoco_that_keeps_its_states_otherwise_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -82,8 +82,8 @@ def test_reset_forgets_the_friction_of_rolling_and_a_batch_rolls_as_its_environm
         alone.step()
     pads = both._pads
     np.testing.assert_array_equal(both.data[0].qpos, alone.data[0].qpos)
-    share = pads._contact.rolling.numpy()[:, 0, 0]  # type: ignore[attr-defined]
+    share = pads.contact.rolling.numpy()[:, 0, 0]  # type: ignore[attr-defined]
     assert share[0, 1] > 0.9 and np.hypot(*share[1]) <= 1.0
     both.reset([0])
-    share = pads._contact.rolling.numpy()[:, 0, 0]  # type: ignore[attr-defined]
+    share = pads.contact.rolling.numpy()[:, 0, 0]  # type: ignore[attr-defined]
     assert not share[0].any() and share[1].any()

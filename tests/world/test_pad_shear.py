@@ -205,7 +205,7 @@ def test_a_body_does_not_creep_while_its_normal_load_vibrates(kind: str, share: 
         # The first minimum lets it settle as far as that load would have let it go from the start: Cattaneo and Mindlin, k as N^(1/3).
         pads = world._pads
         assert isinstance(pads, RigidPads)
-        stiffness = pads._shear.stiffness[0, 0, 0, 0]
+        stiffness = pads.contact.shear.stiffness[0, 0, 0, 0]
         load = np.array([1.0 - share, 1.0])
         least, mean = 1.5 / stiffness * load ** (2.0 / 3.0) * (1.0 - (1.0 - pull / load) ** (2.0 / 3.0))
         # The elements follow that curve within 1 % of the stretch, 0.2 mm.
@@ -269,7 +269,7 @@ def test_beyond_the_limit_it_slips_and_carries_no_more_than_the_cone() -> None:
     assert isinstance(pads, RigidPads)
     for _ in range(20):
         world.step()
-        stuck.append(pads._shear.of(np.zeros(1, int), 0, np.zeros(1, int)).stuck[0])
+        stuck.append(pads.contact.shear.of(np.zeros(1, int), 0, np.zeros(1, int)).stuck[0])
         # About the normal of the dome at the contact's centre.
         force = np.linalg.norm(world.state().wrench["sensor"][0, :3])
         slope = np.abs(world.data[0].qpos[0]) / 0.210
@@ -314,7 +314,7 @@ def test_in_steady_slow_motion_force_and_stretch_are_those_of_theory(
     world, pads = driven(timestep, 0.3)
     start, (stiffness, limit) = (
         world.data[0].qpos[joint],
-        zip(pads._shear.stiffness[0, 0, 0], pads._shear.load[0, 0, 0], strict=True),
+        zip(pads.contact.shear.stiffness[0, 0, 0], pads.contact.shear.load[0, 0, 0], strict=True),
     )
     k, most = (stiffness, limit)[joint - 1]
     full = power * most / k
@@ -325,7 +325,7 @@ def test_in_steady_slow_motion_force_and_stretch_are_those_of_theory(
         moved = world.data[0].qpos[joint] - start
         theory = most * (1.0 - max(1.0 - moved / full, 0.0) ** power)
         assert carried == pytest.approx(theory, abs=0.05 * most)
-        shear = pads._shear.mean[0, 0, 0, 0 if joint == 1 else 2] * k
+        shear = pads.contact.shear.mean[0, 0, 0, 0 if joint == 1 else 2] * k
         assert shear == pytest.approx(carried, abs=0.05 * most)
 
 
@@ -334,7 +334,7 @@ def test_in_steady_slow_motion_force_and_stretch_are_those_of_theory(
 def test_a_torque_that_comes_at_once_is_held_or_turns_a_light_ball(timestep: float, share: float) -> None:
     """Its inertia is nothing to a step of 10 ms; beyond the limit the rest of the torque accelerates it."""
     world, pads = driven(timestep, 0.6, inertia=0.0)
-    limit, inertia = pads._shear.load[0, 0, 0, 1], 0.4 * 0.02 * 5e-3**2
+    limit, inertia = pads.contact.shear.load[0, 0, 0, 1], 0.4 * 0.02 * 5e-3**2
     world.data[0].qfrc_applied[2] = share * limit
     seen = []
     for _ in range(round(0.3 / timestep)):
@@ -363,11 +363,11 @@ def test_a_cube_that_is_pulled_shears_the_gel_as_mindlin_says() -> None:
     for k in range(90):
         world.model.opt.gravity[0] = min(k / 30.0, 1.0) * gravity[0]
         world.step()
-    stiffness, load = pads._shear.stiffness[0, 0, 0, 0], pads._shear.load[0, 0, 0, 0]
+    stiffness, load = pads.contact.shear.stiffness[0, 0, 0, 0], pads.contact.shear.load[0, 0, 0, 0]
     force = float(np.hypot(*world.state().wrench["sensor"][0, :2]))
     expected = 1.5 * load / stiffness * (1.0 - (1.0 - force / load) ** (2.0 / 3.0))
     moved = world.data[0].qpos[0] - start
-    assert pads._shear.stretch[0, 0, 0, :, 0].max() == pytest.approx(expected, rel=0.05)
+    assert pads.contact.shear.stretch[0, 0, 0, :, 0].max() == pytest.approx(expected, rel=0.05)
     # With what it rocks by on the dome the plate moves somewhat more.
     assert moved == pytest.approx(expected, rel=0.25)
 
@@ -379,7 +379,7 @@ def test_a_twist_holds_below_its_limit_and_turns_above() -> None:
         assert isinstance(pads, RigidPads)
         for _ in range(30):
             world.step()
-        limit = pads._shear.load[0, 0, 0, 1]
+        limit = pads.contact.shear.load[0, 0, 0, 1]
         world.data[0].xfrc_applied[world.composed.bodies["cube"].index, 5] = share * limit
         for _ in range(60):
             world.step()
@@ -392,14 +392,14 @@ def test_reset_forgets_the_shear_and_a_batch_shears_as_its_environments_alone() 
     for _ in range(15):
         both.step()
     pads = both._pads
-    assert isinstance(pads, RigidPads) and pads._shear.mean[:, 0, 0, 0].min() > 1e-6
+    assert isinstance(pads, RigidPads) and pads.contact.shear.mean[:, 0, 0, 0].min() > 1e-6
     grid = make_grid(both.composed.sensor_specs[0].gelpad, 0.4e-3)
-    shear = pads.reading("sensor", grid, both.data, np.array([False, True])).shear
-    assert shear is not None and shear.stretch[0, 0] == pytest.approx(pads._shear.mean[0, 0, 0, 0])
+    shear = pads.reading("sensor", grid, np.array([False, True])).shear
+    assert shear is not None and shear.stretch[0, 0] == pytest.approx(pads.contact.shear.mean[0, 0, 0, 0])
     assert 0.0 < shear.stuck[0] < 1.0 and np.isnan(shear.stretch[1]).all() and np.isnan(shear.spin[1])
     both.reset([0])
     alone = cube_on(0.8)
-    assert not pads._shear.stretch[0].any() and pads._shear.stretch[1].any()
+    assert not pads.contact.shear.stretch[0].any() and pads.contact.shear.stretch[1].any()
     both.data[1].qpos[0] += 1e-3
     for _ in range(15):
         both.step()
@@ -418,7 +418,7 @@ def test_a_drag_that_reverses_slips_back_after_twice_the_stretch() -> None:
 
     def slip() -> float:
         """Tangential force of the stretch over that at which the contact slips."""
-        shear = pads._shear
+        shear = pads.contact.shear
         return shear.mean[0, 0, 0, 0] * shear.stiffness[0, 0, 0, 0] / shear.load[0, 0, 0, 0]
 
     assert slip() == pytest.approx(1.0, abs=0.02)

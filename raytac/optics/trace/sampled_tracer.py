@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from typing import Any, NoReturn
 
 import numpy as np
@@ -45,13 +46,20 @@ class SampledTracer(Tracer):
     def render(self, surface: GelSurface, *, spp: int | None = None, seed: int | None = None) -> OpticsImages:
         """As ``DeviceMode.render``, with ``spp`` samples a pixel and random numbers of ``seed``; None is as the tracer was built."""
         heights, failed = self._checked(surface)
-        if not self._lit:
-            return self._images(surface, heights, failed, {})
-        layers = self._layers(heights, checked_ink(surface), spp=spp, seed=seed)
-        images: dict[str, Any] = {"layers": layers} if "layers" in self.outputs else {}
-        if "rgb" in self.outputs:
-            images["rgb"] = self.response.encode_numpy(total(layers))
-        return self._images(surface, heights, failed, images)
+        images: dict[str, Any] = {}
+        if self._lit:
+            layers = self._layers(heights, checked_ink(surface), spp=spp, seed=seed)
+            images = {"layers": layers} if "layers" in self.outputs else {}
+            if "rgb" in self.outputs:
+                images["rgb"] = self.response.encode_numpy(total(layers))
+        seen = {"normals", "depth"} & set(self.outputs)
+        points = self._recorded(self._seen, self._upload(heights), None, None) if seen else None
+        return self._images(surface, failed, images, points)
+
+    def start(self, surface: GelSurface) -> Callable[[], OpticsImages]:
+        """As ``DeviceMode.start``, but the images are there at once: samples are summed up on the host."""
+        images = self.render(surface)
+        return lambda: images
 
     def render_device(self, heights: Float, contact: UInt8 | None = None, ink: Float | None = None) -> NoReturn:
         """Refuse: what is summed up over samples is an image on the host.

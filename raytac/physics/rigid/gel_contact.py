@@ -9,9 +9,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from raytac.errors import InputError
 from raytac.physics.rigid import world_kernels as world
+from raytac.physics.rigid.env_kernels import choose_active, clear_environments
 from raytac.physics.rigid.load_law import shear_modulus
 from raytac.physics.rigid.motion_kernels import Frames, move_bodies, pair_of_gels
+from raytac.physics.rigid.pierced import BondedFaces
 from raytac.physics.rigid.row_kernels import read_rows, set_rows, sum_wrenches
 from raytac.physics.rigid.search import PadSearch
 from raytac.physics.rigid.shear_state import ShearState
@@ -49,7 +52,7 @@ class GelContact:
     """Contacts of B environments with gels, on the CPU or on CUDA.
 
     ``begin`` and ``end`` work on the rows that ``steps.envs`` gives an environment. Between both MuJoCo takes the step. They only launch
-    kernels, always the same ones, so that they can be ``Recorded``. On CUDA the NumPy views are None.
+    kernels, always the same ones, so that they can be ``Recorded``.
 
     Attributes:
         ticks: parts of the scene's step, the length of the shortest one.
@@ -62,7 +65,8 @@ class GelContact:
         rolling: torque of rolling over its bound, about the pad's tangents (B, pads, bodies + pads).
         acceleration: at which contacts closed faster in their last step [m/s²], (B, pads, bodies + pads).
         shear: of the gels.
-        views: of what the host reads.
+        faces: beyond which no body may be.
+        chosen: environments of this step, as ``choose`` named them.
     """
 
     def __init__(
@@ -82,7 +86,8 @@ class GelContact:
         Args:
             gels, bodies: of the world.
             pairs: two gels that may touch, and the search for that.
-            numbers: those of ``Differences`` that environments may change, (B, …); on the CPU the arrays themselves are read in every step.
+            numbers: those of ``Differences`` that environments may change, (B, …); on the CPU the arrays themselves are read in every step,
+                on CUDA ``vary`` copies them again.
             num_envs: B.
             timestep: the scene's step [s].
             case_travel: greatest travel of a body beside a case in a step [m].
@@ -96,6 +101,7 @@ class GelContact:
         self.search = PadSearch(gels, bodies.parts, num_envs=num_envs, ahead=ahead, device=device)
         self._gels, self._touched = _gels(gels, bodies, self.device), _touched(bodies, self.device)
         self._numbers: Any = world.Differences()
+        self._given = dict(numbers)
         for name, values in numbers.items():
             given = wp.array(values, dtype=wp.float64, device=self.device, copy=not self.device.is_cpu)
             setattr(self._numbers, name, given)
@@ -116,7 +122,11 @@ class GelContact:
         self.before = self._zeros(bodies_of, wp.mat44d)
         self.before.fill_(wp.mat44d(*[np.nan] * 16))
         self.shear = ShearState(*slots, device=device)
-        self.views = _Views(self, count) if self.device.is_cpu else None
+        self.chosen: list[int] = []
+        # On the CPU the host writes through views, at no cost; on CUDA it copies.
+        self._envs, self._done = self.steps.envs.numpy(), self.steps.done.numpy()
+        self._cleared = wp.zeros(num_envs, dtype=wp.bool, device=self.device)
+        self.faces = BondedFaces(*self.search.geometry, self.device)
         self._clock, self._case_travel = [float(timestep), self.ticks], float(case_travel)
         self._pairs = [(search, i, count + j) for i, j, search in pairs]
         self._searches = [*([(self.search, 0, 0)] if self.search.pairs else []), *self._pairs]
@@ -128,7 +138,7 @@ class GelContact:
 
         ``whole``: of the scene's step, which is not divided.
         """
-        self.move()
+        self._move_bodies()
         for search, pad, body in self._pairs:
             poses = [self.motion, self.steps, pad, body, *self._clock, search.poses, search.reach]
             self._launch(pair_of_gels, (), poses)
@@ -149,9 +159,14 @@ class GelContact:
                 search.poses.shape[1:],
                 [*results, *shared, self.rolling, self.steps, self.shear.struct, self.slots],
             )
+        self.faces.lose(self.motion, self.steps)
 
     def move(self) -> None:
-        """Motion of bodies alone, with what may have gone through a pad."""
+        """Motion of bodies alone; environments in which a body has gone through a pad are lost."""
+        self._move_bodies()
+        self.faces.lose(self.motion, self.steps)
+
+    def _move_bodies(self) -> None:
         inputs = [self.frames, self.steps, self._gels, self._touched, self.before, *self._clock, self._case_travel]
         self._launch(
             move_bodies, (len(self._gels.thickness),), [*inputs, self.motion, self.slots, self.search.poses, self.search.reach]
@@ -163,12 +178,36 @@ class GelContact:
         self._launch(read_rows, self.force.shape[1:3], [*inputs, self.shear.struct, self.rolling, self.acceleration, self.slots])
         self._launch(sum_wrenches, self.wrenches.shape[1:], [self.slots, self.steps, self._touched, self.wrenches])
 
-    def clear(self, envs: np.ndarray) -> None:
-        """Forget what environments went through, on the CPU."""
-        assert self.views is not None
-        self.shear.clear(envs)
-        self.views.wrench[envs] = self.views.acceleration[envs] = self.views.rolling[envs] = 0.0
-        self.views.before[envs] = np.nan
+    def choose(self, envs: np.ndarray, done: np.ndarray | int) -> None:
+        """Name the n environments of the next step, whose rows are the first n; ``done`` (n,): ticks of the scene's step behind them."""
+        count, self.chosen = len(envs), envs.tolist()
+        self._envs[:count], self._envs[count:] = envs, -1
+        self._done[:count] = done
+        if not self.device.is_cpu:
+            self.steps.envs.assign(self._envs)
+            self.steps.done.assign(self._done)
+
+    def choose_active(self, active: wp.array) -> None:
+        """Make row i of the next step environment i where that is ``active`` (B,), bool, on the device."""
+        self._launch(choose_active, (), [active, self.steps])
+
+    def clear(self, envs: Sequence[int] | np.ndarray) -> None:
+        """Forget what environments went through."""
+        mask = np.zeros(len(self.steps.envs), bool)
+        mask[np.asarray(envs, int)] = True
+        self._cleared.assign(mask)
+        self.clear_active(self._cleared)
+
+    def clear_active(self, mask: wp.array) -> None:
+        """Forget what the environments of a mask (B,), bool, on the device, went through."""
+        kept = [self.shear.struct, self.before, self.acceleration, self.rolling, self.wrenches]
+        self._launch(clear_environments, self.acceleration.shape[1:], [mask, *kept])
+
+    def vary(self) -> None:
+        """Take over what has changed in the arrays of ``numbers``; on the CPU that is done already."""
+        if not self.device.is_cpu:
+            for name, values in self._given.items():
+                getattr(self._numbers, name).assign(values)
 
     def _launch(self, kernel: Any, rest: tuple[int, ...], inputs: Sequence[Any]) -> None:
         """``rest``: threads along the axes after that of environments."""
@@ -184,12 +223,14 @@ class GelContact:
         return struct
 
 
-class _Views:
-    """Arrays of the kernels on the CPU as NumPy sees them."""
+class HostViews:
+    """Arrays of a ``GelContact`` on the CPU as NumPy sees them."""
 
-    def __init__(self, contact: GelContact, bodies: int) -> None:
-        self.envs: np.ndarray = contact.steps.envs.numpy()
-        self.done: np.ndarray = contact.steps.done.numpy()
+    def __init__(self, contact: GelContact) -> None:
+        """Views of ``contact``; raises ``InputError`` if that is not on the CPU."""
+        if not contact.device.is_cpu:
+            raise InputError("contact.device", value=str(contact.device), rule="must be the CPU, where NumPy sees its arrays")
+        bodies = contact.before.shape[2]
         self.ticks: np.ndarray = contact.steps.ticks.numpy()
         self.length: np.ndarray = contact.steps.length.numpy()
         self.lost: np.ndarray = contact.steps.lost.numpy()
@@ -254,7 +295,9 @@ def _array(values: Any, dtype: Any, device: Any) -> wp.array:
 
 
 _FRAMES: dict[str, Any] = dict.fromkeys(("place", "velocity", "spin", "push", "swing"), wp.vec3d) | {"turn": wp.mat33d}
-_STEPS: dict[str, Any] = dict.fromkeys(("envs", "done", "ticks", "lost", "contacts", "slides"), wp.int32) | {"length": wp.float64}
+_STEPS: dict[str, Any] = dict.fromkeys(("envs", "done", "most", "ticks", "lost", "contacts", "slides"), wp.int32) | {
+    "length": wp.float64
+}
 _MOTION: dict[str, Any] = {"pose": wp.mat44d, "velocity": wp.vec3d, "spin": wp.vec3d, "push": wp.float64}
 _SLOTS: dict[str, Any] = {
     "row": wp.int32,

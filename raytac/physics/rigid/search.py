@@ -66,6 +66,11 @@ class PadSearch:
         self._allocate(num_envs)
         self.reserve(self.pairs if self.device.is_cuda else 1)
 
+    @property
+    def geometry(self) -> tuple[PadArrays, ShapeArrays]:
+        """Pads and bodies on the device."""
+        return self._pads, self._shapes
+
     def contacts(self, pad_from_body: np.ndarray, envs: np.ndarray, reach: np.ndarray | float) -> PadContacts:
         """Contacts and gaps of environments.
 

@@ -12,9 +12,20 @@ from raytac.physics.rigid.shear import MOST_RINGS
 from raytac.physics.rigid.world_kernels import Shear
 
 
+class _Member:
+    """An array of ``ShearState`` as NumPy has it."""
+
+    def __set_name__(self, _: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, state: ShearState, _: type) -> np.ndarray:
+        view = state.views.get(self._name)
+        return getattr(state.struct, self._name).numpy() if view is None else view
+
+
 class ShearState:
-    """Stretch of all contacts: one row for each environment, pad and body. The arrays are views of the
-    kernels'; on CUDA only ``struct`` is kept up to date.
+    """Stretch of all contacts: one row for each environment, pad and body. The arrays are views of the kernels'; on CUDA they are copies,
+    which are made when one asks for them.
 
     Attributes:
         stretch: displacement [m] along two tangents and rotation [rad] about the normal, of both parts of every ring, from the middle
@@ -28,7 +39,18 @@ class ShearState:
         play: travel of the centre over the gel and over the body that does not count as rolling yet, along both tangents [m], (…, 2, 2).
         moved: displacement of the body over the gel in the last step, along both tangents [m], (…, 2).
         struct: the arrays for kernels.
+        views: on the CPU, the arrays.
     """
+
+    stretch = _Member()
+    inner = _Member()
+    width = _Member()
+    mean = _Member()
+    stiffness = _Member()
+    load = _Member()
+    centre = _Member()
+    play = _Member()
+    moved = _Member()
 
     def __init__(self, num_envs: int, pads: int, bodies: int, *, device: str = "cpu") -> None:
         shape = num_envs, pads, bodies
@@ -36,28 +58,17 @@ class ShearState:
         for name, (inner, dtype) in _ARRAYS.items():
             setattr(struct, name, wp.zeros((*shape, *inner), dtype=dtype, device=device))
         self.struct = struct
-        self.stretch: np.ndarray = struct.stretch.numpy()
-        self.inner: np.ndarray = struct.inner.numpy()
-        self.width: np.ndarray = struct.width.numpy()
-        self.mean: np.ndarray = struct.mean.numpy()
-        self.stiffness: np.ndarray = struct.stiffness.numpy()
-        self.load: np.ndarray = struct.load.numpy()
-        self.centre: np.ndarray = struct.centre.numpy()
-        self.play: np.ndarray = struct.play.numpy()
-        self.moved: np.ndarray = struct.moved.numpy()
-
-    def clear(self, envs: np.ndarray) -> None:
-        """Forget all contacts of environments."""
-        for name in _ARRAYS:
-            getattr(self, name)[envs] = 0.0
+        on_cpu = wp.get_device(device).is_cpu
+        self.views: dict[str, np.ndarray] = {name: getattr(struct, name).numpy() for name in _ARRAYS} if on_cpu else {}
 
     def of(self, envs: np.ndarray, pad: int, body: np.ndarray) -> ContactShear:
         """Shear of one contact of each environment; body −1 is none."""
         rows = envs, np.full(len(envs), pad), np.maximum(body, 0)
-        touched = (body >= 0) & (self.load[rows][:, 0] > 0.0)
+        load = self.load[rows][:, 0]
+        touched = (body >= 0) & (load > 0.0)
         mean = np.where(touched[:, None], self.mean[rows], 0.0)
         force = np.linalg.norm(mean[:, :2], axis=1) * self.stiffness[rows][:, 0]
-        share = np.minimum(force / np.where(touched, self.load[rows][:, 0], 1.0), 1.0)
+        share = np.minimum(force / np.where(touched, load, 1.0), 1.0)
         stuck = np.where(touched, np.cbrt(1.0 - share), 0.0)
         return ContactShear(mean[:, :2], mean[:, 2], stuck, np.where(touched[:, None], self.centre[rows], 0.0))
 

@@ -130,24 +130,35 @@ def approach(
     )
 
 
+@wp.func
+def least_steps(ticks: wp.int32) -> wp.int32:
+    """Least number of steps in which so many ticks at the end of the scene's step can be done."""
+    result, rest = wp.int32(0), ticks
+    while rest > 0:
+        rest = rest & (rest - 1)
+        result += 1
+    return result
+
+
 @wp.kernel
 def choose_steps(motion: Motion, slots: Slots, timestep: wp.float64, scene_ticks: wp.int32, whole: wp.int32, steps: Steps):
     """Ticks and length of each environment's next step; ``whole``: all of the scene's."""
     i = wp.tid()
+    most = steps.most[i] + 0
+    if whole != 0:
+        most = 1
     longest = wp.float64(timestep)
     for pad in range(slots.row.shape[1]):
         longest = wp.min(longest, motion.case_step[i, pad])
         for body in range(slots.row.shape[2]):
             if slots.row[i, pad, body] >= 0:
                 longest = wp.min(longest, slots.longest[i, pad, body])
-    ticks = wp.int32(scene_ticks)
-    if whole == 0:
-        done = steps.done[i]
-        if done > 0:
-            ticks = done & -done
-        wanted = wp.max(longest / timestep * wp.float64(scene_ticks) * _SLACK, _1)
-        while wp.float64(ticks) > wanted:
-            ticks = ticks // 2
+    done, ticks = steps.done[i] + 0, wp.int32(scene_ticks)
+    if done > 0 and whole == 0:
+        ticks = done & -done
+    wanted = wp.max(longest / timestep * wp.float64(scene_ticks) * _SLACK, _1)
+    while wp.float64(ticks) > wanted and (most == 0 or least_steps(scene_ticks - done - ticks // 2) < most):
+        ticks = ticks // 2
     steps.ticks[i] = ticks
     steps.length[i] = timestep * wp.float64(ticks) / wp.float64(scene_ticks)
     steps.contacts[i] = 0

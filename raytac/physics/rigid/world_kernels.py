@@ -150,6 +150,8 @@ class Steps:
     """Indices among all B; −1 in rows that this step is without."""
     done: wp.array(dtype=wp.int32)
     """Ticks of the scene's step that are done."""
+    most: wp.array(dtype=wp.int32)
+    """Greatest number of steps, with this one, in which the rest of the scene's step is done; 0 is any."""
     ticks: wp.array(dtype=wp.int32)
     """Ticks of this step."""
     length: wp.array(dtype=wp.float64)

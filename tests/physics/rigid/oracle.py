@@ -12,7 +12,7 @@ from raytac.physics.rigid.load_law import LoadLaw
 from raytac.shapes.part import Part
 from raytac.shapes.underside import object_height, object_radius
 from raytac.specs.sensor import GelpadSpec
-from raytac.world.near_pads import half_spaces, near_pad
+from tests.physics.rigid.oracle_near import half_spaces, near_pad
 from tests.physics.rigid.pad_overlap import PadOverlap, Touches, refined
 
 __all__ = ["PadOverlap", "ReferenceSearch"]

@@ -22,8 +22,8 @@ from raytac.shapes.relief import relief_part
 from raytac.shapes.underside import object_height, object_radius
 from raytac.specs import load_sensor
 from raytac.specs.sensor import GelpadSpec
-from raytac.world.forbidden_overlap import BondedFace
 from tests.physics.rigid.oracle import PadOverlap
+from tests.physics.rigid.oracle_pierced import BondedFace
 from tests.physics.rigid.pad_overlap import least_width
 
 DOME = load_sensor("gelsight_mini").gelpad

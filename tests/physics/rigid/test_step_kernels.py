@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
 
+from raytac.errors import InputError
 from raytac.physics.rigid.contacts import LoadTables, PadContacts
-from raytac.physics.rigid.gel_contact import Bodies, GelContact
+from raytac.physics.rigid.gel_contact import Bodies, GelContact, HostViews
 from raytac.physics.rigid.shear import LEAST_RINGS, MOST_RINGS
 from raytac.se3 import rotations
 from raytac.shapes.part import primitive
 from raytac.specs import load_sensor
 from raytac.warp_runtime import Recorded
-from raytac.world.forbidden_overlap import BondedFaces
 from raytac.world.gel_pairs import GelPairs
 from tests.physics.rigid.oracle_motion import PadMotion, cross, motion_of, turned
+from tests.physics.rigid.oracle_pierced import BondedFaces
 from tests.physics.rigid.oracle_rows import gel_rows, rolled_on, row_axes, slip_levers
 from tests.physics.rigid.oracle_shear import ShearOracle
 from tests.physics.rigid.oracle_spring import contact_rate, normal_spring
@@ -307,29 +309,31 @@ def test_a_step_of_the_kernels_is_that_of_numpy(seed: int) -> None:
     slots |= {name: of_slots(contact, name).copy() for name in ("place", "frame", "friction", "force", "regularisation")}
     step = Step(state, contact)
     motion: PadMotion = step.motion
-    assert contact.views is not None
+    views = HostViews(contact)
     for name, expected in (("pose", motion.pad_from_body), ("velocity", motion.velocity), ("spin", motion.spin)):
         same(getattr(contact.motion, name).numpy(), expected)
     same(contact.motion.case_step.numpy(), step.case_step)
     same(contact.search.reach.numpy(), step.reach)
-    np.testing.assert_array_equal(contact.views.lost != 0, step.lost)
+    pierced = BondedFaces(GELS, SHAPES).pierced_on_path(views.poses, views.poses_before, views.suspect != 0)
+    np.testing.assert_array_equal(views.lost != 0, step.lost | pierced.any(axis=(1, 2)))
+    views.lost[:] = step.lost  # what is pierced goes on as well, so that all is compared
     moving = step.contacts.env, step.contacts.pad, step.contacts.body
     expected = np.zeros(slots["row"].shape, bool)
     expected[moving] = True
     np.testing.assert_array_equal(slots["row"] >= 0, expected)
     same(slots["speed"][moving], step.speed)
     same(slots["longest"][moving], step.longest)
-    np.testing.assert_array_equal(contact.views.ticks, step.ticks)
-    np.testing.assert_array_equal(contact.views.length, step.length)
+    np.testing.assert_array_equal(views.ticks, step.ticks)
+    np.testing.assert_array_equal(views.length, step.length)
     expected = np.zeros(slots["row"].shape, bool)
     expected[step.slot] = True
     np.testing.assert_array_equal(slots["held"] != 0, expected)
-    np.testing.assert_array_equal(contact.views.contacts, np.bincount(step.held.env, minlength=ENVS) * ~step.lost)
+    np.testing.assert_array_equal(views.contacts, np.bincount(step.held.env, minlength=ENVS) * ~step.lost)
     assert len(step.held) > ENVS and (step.held.body >= COUNT).any() and (step.held.depth < 0.0).any()
     rows = step.rows
     expected = np.zeros(ENVS, bool)
     expected[step.held.env[rows.slides]] = True
-    np.testing.assert_array_equal(contact.views.slides != 0, expected)
+    np.testing.assert_array_equal(views.slides != 0, expected)
     assert expected.any() and not expected.all()
     same(slots["centre"][step.slot], step.held.centre)
     same(slots["radius"][step.slot], step.radius)
@@ -349,13 +353,13 @@ def test_a_step_of_the_kernels_is_that_of_numpy(seed: int) -> None:
     contact.velocity.assign(velocity)
     contact.end()
     wrench = step.end(force[step.slot], velocity[step.slot])
-    same(contact.views.wrench[~step.lost], wrench[~step.lost], 1e-10)
+    same(views.wrench[~step.lost], wrench[~step.lost], 1e-10)
     for name, values in vars(step.shear).items():
         same(getattr(contact.shear, name)[~step.lost], values[~step.lost], 1e-10)
-    same(contact.views.rolling[~step.lost], step.rolling[~step.lost], 1e-9)
+    same(views.rolling[~step.lost], step.rolling[~step.lost], 1e-9)
     acceleration = np.zeros(slots["held"].shape)
     acceleration[step.slot] = (-velocity[step.slot][:, 0] - step.closing) / rows.step
-    same(contact.views.acceleration[~step.lost], acceleration[~step.lost])
+    same(views.acceleration[~step.lost], acceleration[~step.lost])
 
 
 def test_shear_of_loads_that_swing_is_that_of_numpy() -> None:
@@ -457,6 +461,59 @@ def test_kernels_that_are_recorded_do_the_same_on_every_repeat() -> None:
         np.testing.assert_array_equal(contact.wrenches.numpy(), plain.wrenches.numpy())
 
 
+def left_by(contact: GelContact) -> dict[str, np.ndarray]:
+    """All that outlasts a step."""
+    result = {name: getattr(contact, name).numpy().copy() for name in ("before", "acceleration", "rolling", "wrenches")}
+    names = "stretch", "inner", "width", "mean", "stiffness", "load", "centre", "play", "moved"
+    return result | {name: getattr(contact.shear, name).copy() for name in names}
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_environments_that_are_cleared_forget_everything_and_the_others_nothing(device: str) -> None:
+    wp.init()
+    contact = gel_contact(random_state(7, 12), device)
+    results(contact)
+    was = left_by(contact)
+    contact.clear([2, 5])
+    assert all(values[[2, 5]].any() for values in was.values())
+    for name, values in left_by(contact).items():
+        fresh = np.full_like(values[[2, 5]], np.nan if name == "before" else 0.0)
+        np.testing.assert_array_equal(values[[2, 5]], fresh, err_msg=name)
+        others = np.delete(np.arange(12), [2, 5])
+        np.testing.assert_array_equal(values[others], was[name][others], err_msg=name)
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_environments_are_chosen_in_any_order_or_in_place(device: str) -> None:
+    wp.init()
+    contact = gel_contact(random_state(7, 4), device)
+    contact.choose(np.array([3, 1]), np.array([8, 4]))
+    assert contact.steps.envs.numpy().tolist() == [3, 1, -1, -1] and contact.chosen == [3, 1]
+    assert contact.steps.done.numpy()[:2].tolist() == [8, 4]
+    contact.choose_active(wp.array([True, False, False, True], dtype=wp.bool, device=device))
+    assert contact.steps.envs.numpy().tolist() == [0, -1, -1, 3] and not contact.steps.done.numpy().any()
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_numbers_of_environments_may_change(device: str) -> None:
+    """Softer gels carry less, in their environments alone, once ``vary`` has taken them over."""
+    wp.init()
+    state = random_state(7, 4)
+    contact, plain = gel_contact(state, device), results(gel_contact(state, device))
+    state.numbers["gel_stiffness"][2] *= 0.5
+    contact.vary()
+    changed = results(contact)["force"]
+    assert (changed[2] != plain["force"][2]).any()
+    np.testing.assert_array_equal(np.delete(changed, 2, axis=0), np.delete(plain["force"], 2, axis=0))
+
+
+def test_views_of_the_host_are_on_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    contact = gel_contact(random_state(7, 1))
+    monkeypatch.setattr(contact, "device", SimpleNamespace(is_cpu=False))
+    with pytest.raises(InputError, match="must be the CPU"):
+        HostViews(contact)
+
+
 @pytest.mark.gpu
 def test_cuda_gives_what_the_cpu_gives() -> None:
     wp.init()
@@ -481,8 +538,7 @@ def test_what_a_bonded_face_refuses_is_suspected() -> None:
     state.frames["place"][:, 1] = [0.0, 0.0, 0.5]
     state.frames["place"][:, PADS:] = rng.uniform([-0.02, -0.02, -0.02], [0.02, 0.02, 0.01], (60, COUNT, 3))
     contact, faces = gel_contact(state), BondedFaces(GELS, SHAPES)
-    views = contact.views
-    assert views is not None
+    views = HostViews(contact)
     contact.move()
     poses = views.poses.copy()
     pierced = faces.pierced(poses)
@@ -492,8 +548,7 @@ def test_what_a_bonded_face_refuses_is_suspected() -> None:
     state = taken(state, np.arange(3))
     state.frames["place"][:, PADS:] = [0.0, 0.0, -0.1]
     contact = gel_contact(state)
-    views = contact.views
-    assert views is not None
+    views = HostViews(contact)
     above = np.tile(np.eye(4), (3, PADS, COUNT, 1, 1))
     above[..., 2, 3] = 0.05
     views.before[:] = above
@@ -502,3 +557,4 @@ def test_what_a_bonded_face_refuses_is_suspected() -> None:
     np.testing.assert_array_equal(views.poses_before, above)
     np.testing.assert_array_equal(views.before, views.poses)
     assert some[:, 0].all() and faces.pierced_on_path(views.poses, above, some)[:, 0].all()
+    assert (views.lost != 0).all()

@@ -1,4 +1,7 @@
-"""Contacts of gels among MuJoCo's own: put there between ``mj_step1`` and ``mj_step2``, and read after it, for all environments at once."""
+"""C MuJoCo under rigid pads: one ``MjData`` an environment, whose memory kernels read and write for all environments at once.
+
+Contacts of gels are put among MuJoCo's own between ``mj_step1`` and ``mj_step2``.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +15,12 @@ import numpy as np
 import warp as wp
 
 from raytac.errors import InputError
-from raytac.physics.rigid.gel_contact import GelContact
+from raytac.physics.rigid.gel_contact import GelContact, HostViews
 from raytac.physics.rigid.world_kernels import ROWS
+from raytac.robots.mujoco_memory import checked_layouts, same_states
+from raytac.robots.states import StateReader, body_pose, site_pose
 from raytac.warp_runtime import Recorded
-from raytac.world.implicit_damping import ImplicitDamping
-from raytac.world.mujoco_kernels import (
+from raytac.world.engine.c_kernels import (
     Memory,
     correct_lifts,
     read_constraint,
@@ -25,39 +29,48 @@ from raytac.world.mujoco_kernels import (
     write_references,
     write_regularisation,
 )
-from raytac.world.mujoco_memory import checked_layouts
+from raytac.world.environment_models import EnvironmentModels
+from raytac.world.implicit_damping import ImplicitDamping
+from raytac.world.pad_contact import PadIndices
+from raytac.world.world_state import lost
 
 
-class MujocoRows:
-    """Kernels on the states of B environments, and MuJoCo's calls between them."""
+class CMujoco:
+    """States of B environments that C MuJoCo steps, each by the length of its own step; see ``Engine``.
+
+    Attributes:
+        divides, device: as of ``Engine``.
+    """
+
+    divides = True
 
     def __init__(
         self,
-        model: mujoco.MjModel,
         contact: GelContact,
+        pads: PadIndices,
+        models: EnvironmentModels,
+        datas: Sequence[mujoco.MjData],
         *,
-        sites: np.ndarray,
-        bodies: np.ndarray,
-        geoms: np.ndarray,
-        hard: np.ndarray,
+        timestep: float,
     ) -> None:
-        """Prepare the kernels; ``bind`` names the states.
+        """Prepare the kernels.
 
         Args:
-            model: any of the environments'.
-            contact: the gels' contacts.
-            sites: at the pads' frames, (pads,).
-            bodies: that carry the pads, then those that they touch.
-            geoms: of the bodies that pads touch, then of the gels.
-            hard: geoms with the law of ``hard_contacts``, (ngeom,), bool.
+            contact: the gels' contacts, on the CPU.
+            pads: what the models call pads and what they touch.
+            models: of the environments; a variation may replace one.
+            datas: their states; ``bind`` names others.
+            timestep: of the models [s], as the pads know it.
         """
-        num_envs, pads = contact.wrenches.shape
+        model, num_envs = models[0], len(datas)
+        self.device = contact.device
         state, one = checked_layouts()
-        assert contact.views is not None  # they are on the CPU
-        self._views, self._blank, self._damping = contact.views, _blank(), ImplicitDamping(model)
+        self._models_now, self._pads, self._timestep = models, pads, timestep
+        self._contact, self._views, self._blank, self._damping = contact, HostViews(contact), _blank(), ImplicitDamping(model)
         self._address, self._sparse = np.zeros(num_envs, np.uint64), np.zeros(1, np.int32)
         self._datas: list[mujoco.MjData] = []
         self._models: list[mujoco.MjModel] = []
+        self._poses: StateReader | None = None
         self._options: list[Any] = []
         memory: Any = Memory()
         memory.states = wp.array(self._address, dtype=wp.uint64, device="cpu", copy=False)
@@ -71,83 +84,92 @@ class MujocoRows:
             setattr(memory, name, one.offset[name] // 8)
         for name in _INTEGERS:
             setattr(memory, name, one.offset[name] // 4)
-        steps, slots = contact.steps, contact.slots
+        steps, slots, bodies = contact.steps, contact.slots, np.concatenate([pads.carriers, pads.bodies])
         roots, last = model.body_rootid[bodies], np.array([_last_dof(model, body) for body in bodies.tolist()])
-        indices = [_array(values) for values in (sites, bodies, roots, last, model.dof_parentid)]
-        gels, others = _array(geoms[len(geoms) - pads :]), _array(geoms)
+        indices = [_array(values) for values in (pads.sites, bodies, roots, last, model.dof_parentid)]
+        gels, others = _array(pads.geoms[len(pads.bodies) :]), _array(pads.geoms)
         launch = partial(wp.launch, device="cpu")
         frames = [memory, steps, *indices, contact.frames]
-        read = partial(launch, read_frames, dim=(num_envs, len(bodies)), inputs=frames)
         forces = [memory, slots, steps, contact.force, contact.velocity]
-        self._begin = [Recorded(read, partial(contact.begin, whole=whole)) for whole in (False, True)]
-        self._move = Recorded(read, contact.move)
-        self._end = Recorded(partial(launch, read_constraint, dim=num_envs, inputs=forces), contact.end)
+        self.read_frames = partial(launch, read_frames, dim=(num_envs, len(bodies)), inputs=frames)
+        self.read_rows = partial(launch, read_constraint, dim=num_envs, inputs=forces)
         self._write, self._regularise, self._refer, self._correct = (
             Recorded(partial(launch, kernel, dim=num_envs, inputs=[memory, steps, slots, *more]))
             for kernel, more in (
                 (write_contacts, [gels, others]),
                 (write_regularisation, []),
-                (write_references, [_array(hard)]),
+                (write_references, [_array(pads.hard)]),
                 (correct_lifts, []),
             )
         )
+        self.bind(datas)
 
-    def bind(self, models: Sequence[mujoco.MjModel], datas: Sequence[mujoco.MjData]) -> None:
-        """Name the states, and their models, that the next calls work on."""
-        if not _same(datas, self._datas):
+    def bind(self, datas: Sequence[mujoco.MjData]) -> None:
+        """Name the states that the next calls work on."""
+        if not same_states(datas, self._datas):
             self._datas = list(datas)
             self._address[:] = [data._address for data in datas]
-        if not _same(models, self._models):
-            self._models = list(models)
+            self._poses = None
+
+    def prepare(self) -> None:
+        """Take over models that were replaced.
+
+        Raises:
+            InputError: a model has another timestep than at first, or a cone in which pads cannot act.
+        """
+        models = [self._models_now[b] for b in range(len(self._datas))]
+        if not same_states(models, self._models):
+            self._models = models
             self._options = [model.opt for model in models]
         self._sparse[0] = mujoco.mj_isSparse(models[0])
-
-    def check_options(self, timestep: float) -> None:
-        """Raise ``InputError`` where a model has another timestep than ``timestep`` [s], or a cone in which pads cannot act."""
         options = self._options[0]
-        if options.timestep != timestep:
-            rule = f"must stay {timestep!r} s, with which the pads were made"
+        if options.timestep != self._timestep:
+            rule = f"must stay {self._timestep!r} s, with which the pads were made"
             raise InputError("model.opt.timestep", value=options.timestep, rule=rule)
         if options.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:
             raise InputError("model.opt.cone", value="pyramidal", rule="must stay elliptic, since a gel sticks by its shear")
 
-    def first_half(self, envs: Sequence[int]) -> None:
+    def invalid(self) -> np.ndarray:
+        """As of ``Engine``."""
+        return lost(self._datas)
+
+    def begin_step(self) -> None:
         """``mj_step1``."""
-        for b in envs:
+        for b in self._envs():
             mujoco.mj_step1(self._models[b], self._datas[b])
 
-    def counts(self, envs: Sequence[int]) -> list[tuple[int, int]]:
+    def counts(self, envs: Sequence[int] | np.ndarray) -> list[tuple[int, int]]:
         """Contacts and rows that MuJoCo has, of each environment."""
         return [(self._datas[b].ncon, self._datas[b].nefc) for b in envs]
 
-    def accelerate(self, envs: Sequence[int]) -> None:
-        """Accelerations that everything but contacts and other constraints would give, by the controls; ``mj_step2`` finds the same."""
-        for b in envs:
+    def free_acceleration(self) -> None:
+        """As of ``Engine``; ``mj_step2`` gives the same."""
+        for b in self._envs():
             mujoco.mj_fwdActuation(self._models[b], self._datas[b])
             mujoco.mj_fwdAcceleration(self._models[b], self._datas[b])
 
-    def choose(self, envs: np.ndarray, done: np.ndarray | int) -> None:
-        """Name the environments of this step, which have done these ticks of the scene's."""
-        views, count = self._views, len(envs)
-        views.envs[:count], views.envs[count:] = envs, -1
-        views.done[:count] = done
+    def update_poses(self) -> None:
+        """``mj_kinematics``."""
+        for b in self._envs():
+            mujoco.mj_kinematics(self._models[b], self._datas[b])
 
-    def begin(self, *, whole: bool = False) -> None:
-        """``GelContact.begin`` with the present frames, after ``choose`` and ``accelerate``."""
-        self._begin[whole]()
+    def read_poses(self) -> tuple[np.ndarray, np.ndarray]:
+        """``world_from_pad`` (B, pads, 4, 4) and ``world_from_body`` (B, bodies, 4, 4), as the last step or ``update_poses`` left them."""
+        if self._poses is None:
+            members = {"pads": site_pose(self._pads.sites), "bodies": body_pose(self._pads.bodies)}
+            self._poses = StateReader(self._datas, members)
+        poses = self._poses.values()
+        return poses["pads"], poses["bodies"]
 
-    def move(self) -> None:
-        """``GelContact.move`` with the present frames, after ``choose``."""
-        self._move()
+    def _envs(self) -> list[int]:
+        """Environments of this step."""
+        return self._contact.chosen
 
-    def put(self, envs: Sequence[int], *, own_step: bool) -> None:
-        """Put the contacts that ``GelContact.begin`` found after MuJoCo's own.
-
-        An environment whose memory for contacts is full is lost, with a ``RuntimeWarning``. ``own_step``: ``second_half`` follows, not
-        somebody else's ``mj_step2``.
-        """
+    def put_contacts(self, *, own_step: bool = True) -> None:
+        """As of ``Engine``; an environment whose memory for contacts is full is lost with a ``RuntimeWarning``."""
         self._damping.clear()
-        count, blank, views = len(envs), self._blank, self._views
+        envs, blank, views = self._envs(), self._blank, self._views
+        count = len(envs)
         lost, rows = views.lost[:count].tolist(), []
         for i, number in enumerate(views.contacts[:count].tolist()):
             if not number or lost[i]:
@@ -191,8 +213,9 @@ class MujocoRows:
                 mujoco.mj_fwdConstraint(self._models[envs[i]], self._datas[envs[i]])
             self._correct()
 
-    def second_half(self, envs: Sequence[int], timestep: float) -> None:
-        """``mj_step2`` of the length of each environment's step, if it is not lost; afterwards the models have ``timestep`` [s] again."""
+    def end_step(self) -> None:
+        """``mj_step2`` of the length of each environment's step, if it is not lost; afterwards the models have their timestep again."""
+        envs, timestep = self._envs(), self._timestep
         models, datas, options, views = self._models, self._datas, self._options, self._views
         lengths, lost = views.length[: len(envs)].tolist(), views.lost[: len(envs)].tolist()
         for row, b in enumerate(envs):
@@ -214,10 +237,6 @@ class MujocoRows:
         rule = 'MuJoCo has no memory left for its contacts: raise memory of <size memory="..."/>, or spec.memory'
         warnings.warn(f"environment {env} failed: {rule}", RuntimeWarning, stacklevel=2)
 
-    def end(self) -> None:
-        """``GelContact.end`` with the forces and velocities of the rows; environments that broke down are lost."""
-        self._end()
-
 
 _SOLVES = 5
 """Solves of MuJoCo's at most for the lift of a slide that begins or ends."""
@@ -228,10 +247,6 @@ def _last_dof(model: mujoco.MjModel, body: int) -> int:
     while body and not model.body_dofnum[body]:
         body = int(model.body_parentid[body])
     return int(model.body_dofadr[body] + model.body_dofnum[body]) - 1 if body else -1
-
-
-def _same(one: Sequence[Any], other: Sequence[Any]) -> bool:
-    return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
 
 
 def _array(values: np.ndarray) -> wp.array:

@@ -8,6 +8,8 @@ declaration MuJoCo ships (``mujoco.introspect``). Its layout by C's rules is com
 from __future__ import annotations
 
 import functools
+import operator
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -68,6 +70,7 @@ def checked_layouts() -> tuple[Layout, Layout]:
     model = mujoco.MjModel.from_xml_string(_BALLS)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
+    data.time = 0.12345678901234567
     whole = words(data, state.size)
     known = [name for name in _ARRAYS if address(getattr(data, name)) != whole[state.offset[name] // _WORD]]
     first = address(data.contact.dist)
@@ -75,12 +78,18 @@ def checked_layouts() -> tuple[Layout, Layout]:
     if data.contact.dist.strides[0] != contact.size or first != whole[state.offset["contact"] // _WORD]:
         known.append("contact")
     numbers = whole.view(np.int32)
+    known += ["time"] if whole.view(float)[state.offset["time"] // _WORD] != data.time else []
     known += [name for name in ("ncon", "nefc") if numbers[state.offset[name] // 4] != getattr(data, name)]
     if known:
         raise BackendError(
             f"MuJoCo {mujoco.__version__} keeps {known} elsewhere than it declares: rigid pads cannot act on its states"
         )
     return state, contact
+
+
+def same_states(one: Sequence[object], other: Sequence[object]) -> bool:
+    """True if two sequences hold the same objects."""
+    return len(one) == len(other) and all(map(operator.is_, one, other))
 
 
 def words(data: mujoco.MjData, size: int) -> np.ndarray:

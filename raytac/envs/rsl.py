@@ -1,0 +1,138 @@
+"""Environments for rsl_rl: vectors of ours, in this process or in several, as its ``VecEnv``."""
+
+# pyright: reportMissingImports=false
+# (rsl_rl and PyTorch belong to the extra "rl", which the tests do without.)
+
+from __future__ import annotations
+
+from multiprocessing.shared_memory import SharedMemory
+from typing import Any
+
+import numpy as np
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+from raytac.checks import check_whole
+from raytac.envs.environments import TactileVectorEnv
+from raytac.envs.flat import FlatLayout, FlatVector, serve_flat, shared_arrays
+from raytac.envs.processes import Workers
+from raytac.errors import InputError
+
+
+class RslVecEnv(VecEnv):
+    """Environments of one task with the observation groups ``actor`` and ``critic`` of ``FlatVector``.
+
+    ``extras`` of a step hold ``time_outs`` (an end by broken physics is none: no return is to be expected from beyond it), ``success`` and
+    ``failed``, each (B,), and in ``log`` the mean of every term of the reward.
+    """
+
+    def __init__(
+        self,
+        kind: type[TactileVectorEnv],
+        *,
+        num_envs: int,
+        processes: int = 0,
+        device: str = "cpu",
+        reward_scale: float = 1.0,
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
+        """Make the environments; ``reset`` begins the episodes.
+
+        Args:
+            kind: the task's vector, such as ``PushCubeVectorEnv``.
+            num_envs: number of environments in all.
+            processes: processes that these are spread over, each with a world of its own; 0 is this process.
+            device: of the tensors; that of the worlds is among ``options``, as ``world_device``.
+            reward_scale: factor of the reward.
+            seed: of environment 0; environment b has seed + b.
+            options: ``history`` of ``FlatVector``, and those of ``TaskBatch``.
+
+        Raises:
+            InputError: a number of environments that the processes cannot share evenly; as ``TaskBatch``.
+        """
+        options["device"] = options.pop("world_device", "cpu")
+        self.num_envs, self.device, self.reward_scale = check_whole("num_envs", num_envs), device, reward_scale
+        self._workers: Workers | None = None
+        self._vector: FlatVector | None = None
+        if processes:
+            self._workers = Workers(serve_flat, kind, num_envs, processes, seed, **options)
+            self.layout: FlatLayout = self._workers.made[0]
+            size = 4 * num_envs * sum(int(np.prod(shape)) for shape in self.layout.fields.values())
+            self._memory = SharedMemory(create=True, size=size)
+            self._arrays = shared_arrays(self._memory, self.layout.fields, num_envs)
+            each = self._workers.each
+            self._ask("attach", [(self._memory.name, k * each, num_envs) for k in range(processes)])
+        else:
+            self._vector = FlatVector(kind, num_envs, seed=seed, **options)
+            self.layout, self._arrays = self._vector.layout, self._vector.buffers
+        self.num_actions, self.max_episode_length = self.layout.fields["action"][0], self.layout.max_episode_steps
+        self.cfg = {"kind": kind.__name__, **{name: str(value) for name, value in options.items()}}
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:  # type: ignore[override]
+        """Steps (B,) since the start of each episode. Setting them ends the episodes as much earlier."""
+        return self._tensor("age").long()
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps: torch.Tensor) -> None:
+        self._arrays["age"][:] = steps.cpu().numpy()
+
+    def reset(self, seed: int | None = None) -> TensorDict:
+        """Begin all episodes, environment b with seed + b; None goes on with the present random streams."""
+        if self._workers is None:
+            assert self._vector is not None
+            self._vector.reset(seed)
+        else:
+            each = self._workers.each
+            self._ask("reset", [None if seed is None else seed + k * each for k in range(len(self._workers))])
+        return self.get_observations()
+
+    def get_observations(self) -> TensorDict:
+        """Observations after the last step or reset."""
+        return TensorDict({name: self._tensor(name) for name in ("actor", "critic")}, batch_size=[self.num_envs])
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
+        """Step all environments with actions (B, k), cut to [−1, 1]; those that end begin again.
+
+        Raises:
+            InputError: actions that are not finite; the message names the environment.
+        """
+        values = actions.detach().cpu().numpy()
+        if not np.isfinite(values).all():
+            env = int(np.argwhere(~np.isfinite(values))[0, 0])
+            raise InputError("actions", value=values[env].tolist(), rule=f"must be finite; in environment {env} they are not")
+        self._arrays["action"][:] = values
+        if self._workers is None:
+            assert self._vector is not None
+            self._vector.step()
+        else:
+            self._ask("step", [None] * len(self._workers))
+        terminated, truncated, failed = (self._tensor(name) for name in ("terminated", "truncated", "failed"))
+        extras = {
+            "time_outs": truncated * (1.0 - failed),
+            "success": self._tensor("success"),
+            "failed": failed,
+            "log": {f"/reward/{name}": float(self._arrays["terms"][:, i].mean()) for i, name in enumerate(self.layout.terms)},
+        }
+        done = torch.maximum(terminated, truncated)
+        return self.get_observations(), self.reward_scale * self._tensor("reward"), done, extras
+
+    def close(self) -> None:
+        """End the processes and free the shared memory."""
+        if self._workers is not None:
+            self._workers.close()
+            self._arrays = {}
+            self._memory.close()
+            self._memory.unlink()
+            self._workers = None
+
+    def _tensor(self, name: str) -> torch.Tensor:
+        """A copy on the device."""
+        return torch.tensor(self._arrays[name], device=self.device)
+
+    def _ask(self, command: str, values: list[Any]) -> None:
+        assert self._workers is not None
+        self._workers.send(command, values)
+        self._workers.replies()
