@@ -69,7 +69,8 @@ def insert_peg(batch: TaskBatch) -> np.ndarray:
     aside = np.concatenate([SOCKET - tip[:, :2], np.zeros((len(tip), 1))], axis=1)
     distance, high = np.linalg.norm(aside, axis=1), tip[:, 2] > RIM + 2e-3
     inside = (tip[:, 2] < RIM) & (distance < 1e-3)
-    carry = np.where((high | inside)[:, None], aside, 0.0)
+    # The arm lags behind its target, which is to stop over the socket.
+    carry = np.where((high | inside)[:, None], aside - (batch.target[:, :3, 3] - tool) * [1.0, 1.0, 0.0], 0.0)
     carry[:, 2] = np.where(inside | (distance < 3e-4), -4e-3, RIM + 6e-3 - tip[:, 2])
     action[grasped, :3] = 0.5 * np.clip(carry[grasped] / 4e-3, -1.0, 1.0)
     return action
