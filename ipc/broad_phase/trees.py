@@ -121,7 +121,7 @@ def query(
     # outputs
     candidates: Candidates,
 ):
-    """Vertices against faces, or edges against edges (``ee``), of the bodies that theirs may touch.
+    """Vertices against faces, or edges against edges (``ee``), of bodies that may touch.
 
     Within one body each pair of edges is looked at once.
     """

@@ -283,9 +283,8 @@ class Collision:
     ) -> None:
         """Lower ``alpha`` (B,) to the share of dx that leaves ``slack`` of every distance.
 
-        No distance falls below ``floor`` (B,) [m] either.
-
-        ``reach`` (B,) is the largest coordinate [m]: no step ends with distances that rounding could close.
+        No distance falls below ``floor`` (B,) [m] either. ``reach`` (B,) is the largest coordinate [m]: no step ends with distances
+        that rounding could close.
         """
         if self._meshes:
             for ee, items in ((False, self.candidates.pt), (True, self.candidates.ee)):

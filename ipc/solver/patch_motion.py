@@ -69,9 +69,7 @@ class RestPatches:
     def motion(self, potential: Potential, env: int, patch: NDArray[np.integer], force: float = 0.0) -> PatchMotion:
         """Motion of the nodes ``patch`` (n,) of the layout in one environment, without bonded ones.
 
-        ``force``: size of the force on the patch [N].
-
-        Raises ``ValueError`` where none of them is free to move.
+        ``force``: size of the force on the patch [N]. Raises ``ValueError`` where none of them is free to move.
         """
         inner, layout = self._inner, self._layout
         place = np.full(len(layout.node_rest), -1)

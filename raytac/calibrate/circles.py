@@ -44,9 +44,7 @@ class FoundCircles:
 def find_circles(presses: RealPresses, pixel_pitch: float) -> FoundCircles:
     """The contact circle of every press, without labels.
 
-    ``pixel_pitch`` [m]: a contact is not wider than its ball.
-
-    Raises InputError for a ball whose contact could be wider than the image.
+    ``pixel_pitch`` [m]: a contact is not wider than its ball. Raises InputError for a ball whose contact could be wider than the image.
     """
     smallest = min(presses.resolution)
     widest = presses.ball_radius / pixel_pitch

@@ -43,9 +43,9 @@ SIGMA = {
     "vignette": 0.5,
     "slope": 0.15,
 }
-"""Standard deviation of a parameter about its start: mm, rad, 1, full scales (own channel), …"""
+"""Standard deviation of a parameter about its start [mm, rad, 1 or full scales]."""
 CIRCLE_SIGMA = np.array([1.0, 1.0, 1.5]) / 320
-"""Standard deviation of a contact circle about its label: x, y, radius, over the image's width."""
+"""Standard deviation of a circle's x, y and radius about its label, over the image's width."""
 CIRCLE_PRIOR = 300.0
 """Squared residual [levels²] that a circle's deviation of one sigma is worth."""
 ACTIVE = 6
@@ -103,7 +103,7 @@ class DirectFit:
         extra: ExtraLight | None = None,
         seed: int = 0,
     ) -> None:
-        """``factor``: images are means of factor × factor pixels; ``start`` is the prior of lights and imprint."""
+        """``factor``² pixels are averaged to one; ``start`` is the prior of lights and imprint."""
         self.sensor, self.shots, self.start, self.settings = sensor, shots, start, settings
         small, coarse = shots.shrunk(factor), shots.shrunk(REST_FACTOR)
         height, width = small.background.shape[:2]
@@ -227,7 +227,7 @@ class DirectFit:
         return float(images + priors)
 
     def jacobian(self, state: FitState) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """(presses by the vector (3M, G), image at rest by it (3K, G), presses by their own circles (3M, 3), the two images)."""
+        """Jacobians of presses (3M, G), rest (3K, G) and presses by circles (3M, 3); both images."""
         p, seen = state.p, self.geometry(state)
         geometries = (seen, self.flat_geometry, self.rest_geometry)
         leds = [[led_light(g, led, REFERENCE_DISTANCE) for led in p.leds] for g in geometries]

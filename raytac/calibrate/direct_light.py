@@ -30,8 +30,8 @@ class LedLight:
     light: np.ndarray
     """D, (M,)."""
     by_led: np.ndarray
-    """By the first six of a row of ``LightParameters.leds``, (6, M): position [1/mm], azimuth and elevation [1/rad], lobe; a point has no
-    height."""
+    """By the first six of a row of ``LightParameters.leds``, (6, M); a point has no height.
+    Position [1/mm], azimuth and elevation [1/rad], lobe."""
     by_normal: np.ndarray
     """By the point's normal, (3, M). By the point itself it is minus that by the LED's position."""
 

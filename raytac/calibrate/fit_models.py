@@ -27,7 +27,7 @@ from raytac.optics.trace.tracer import Tracer
 from raytac.specs import SensorSpec
 
 ALONE = "raytrace_alone"
-"""The fitted ray tracer without a photograph: colour shading (``with_shading``) in place of the flat field, as a sensor file has it."""
+"""The fitted ray tracer with colour shading (``with_shading``) in place of a flat field."""
 MODES = ("raytrace", ALONE, "taxim", "mlp", "phong")
 """Modes that are compared, beside the background alone."""
 SHADOW_TABLES = ("none", "raytrace")

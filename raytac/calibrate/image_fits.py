@@ -35,9 +35,9 @@ class TableSettings:
     """Settings of ``fit_table``."""
 
     n_bins: int = 60
-    """Bins of the slope's magnitude, and of its direction. Upstream has 125; 20 presses of a Mini fill more of half as many."""
+    """Bins of magnitude and direction; 20 presses of a Mini do not fill upstream's 125."""
     neighbours: float = 1.0
-    """Weight of the eight bins around a bin, over its own. More than in ``BakeSettings``, since photographs are few."""
+    """Weight of a bin's eight neighbours over its own, high since photographs are few."""
     ridge: float = 1e-4
     """Ridge of the least squares, as in ``BakeSettings``."""
 
@@ -103,9 +103,8 @@ def press_samples(
 ) -> PressSamples:
     """Samples within ``reach`` radii of the ``circles`` (N, 3) [px] of ``shots``.
 
-    Their imprints have the ``slopes`` of ``imprint``.
-
-    ``least``: displacement [m] from which a pixel is a sample. ``pitch``: spacing of the pad's nodes [m], about a pixel's.
+    Their imprints have the ``slopes`` of ``imprint``. ``least``: displacement [m] from which a pixel is a sample. ``pitch``: spacing of
+    the pad's nodes [m], about a pixel's.
     """
     height, width = shots.background.shape[:2]
     background = np.zeros((height, width, 3), np.uint8)  # the front step needs none
@@ -135,9 +134,7 @@ def fit_table(
 ) -> PolyTable:
     """Taxim table of ``samples`` over the real ``background`` (H, W, 3) [levels].
 
-    Its sheets are those of ``two_sheets``.
-
-    It has no shadows: photographs of balls say too little about them.
+    Its sheets are those of ``two_sheets``. It has no shadows: photographs of balls say too little about them.
     """
     height, width = background.shape[:2]
     i, j = slope_bins(samples.slope_x, samples.slope_y, settings.n_bins)
@@ -166,10 +163,8 @@ def with_cast_shadows(
 ) -> PolyTable:
     """``table`` with a shadow table of pins and balls.
 
-    The ray tracer renders them under the fitted lights of ``lit``.
-
-    The table's background is their flat field, so that both tables are differences in levels from one image by one response. ``tick`` is
-    called with the number of images rendered so far.
+    The ray tracer renders them under the fitted lights of ``lit``. The table's background is their flat field, so that both tables are
+    differences in levels from one image by one response. ``tick`` is called with the number of images rendered so far.
     """
     height, width = table.background.shape[:2]
     field = np.clip(np.rint(table.background), 0, 255).astype(np.uint8)

@@ -1,9 +1,7 @@
 """Imprint of a ball: one radial profile of slopes about each contact circle.
 
-All presses of a calibration share it.
-
-Photographs show where a ball touched, but not how the gel around it deformed. So the slope of the coat is a free function of the
-distance ρ = t a from the ball's axis over the contact radius a, fitted with the lights:
+All presses of a calibration share it. Photographs show where a ball touched, but not how the gel around it deformed. So the slope of
+the coat is a free function of the distance ρ = t a from the ball's axis over the contact radius a, fitted with the lights:
 
     sin θ(t) = s(t) · a / R,  s linear between ``KNOTS``,
 
@@ -22,7 +20,7 @@ from raytac.gel.surface import GelSurface, PadGrid, rest_height
 from raytac.specs.sensor import SensorSpec
 
 KNOTS = np.array([0.0, 0.3, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5, 1.75, 2.0, 2.4, 3.0])
-"""Distances from the axis, over the contact radius, between which the slope is linear; it is 0 at the first and the last."""
+"""Distances over the contact radius between which the slope is linear; 0 at both ends."""
 RIGID_PAD = np.array([0.3, 0.6, 0.69, 0.76, 0.72, 0.58, 0.46, 0.36, 0.24, 0.15, 0.06, 0.02, 0.01])
 """s at the inner knots, about the rigid pad's (docs/rigid-pad.md): where a fit starts."""
 WIDEST = 0.95
@@ -84,10 +82,9 @@ def pixel_geometry(
 ) -> PixelGeometry:
     """Coat seen by the pixels ``u``, ``v`` (M,) of the presses ``press`` (M,).
 
-    Pixels are those of the sensor's resolution.
-
-    ``circles`` (N, 3) [px], ``ball_radius`` (N,) [m]; ``slopes``: s at the inner ``KNOTS``. Where ``press`` is −1 the pad is at rest.
-    The ray is met by iterating its height; slopes of the view are below 0.4, so that six steps leave less than a micrometre.
+    Pixels are those of the sensor's resolution. ``circles`` (N, 3) [px], ``ball_radius`` (N,) [m]; ``slopes``: s at the inner
+    ``KNOTS``. Where ``press`` is −1 the pad is at rest. The ray is met by iterating its height; slopes of the view are below 0.4, so
+    that six steps leave less than a micrometre.
     """
     camera, (rx, ry) = sensor.camera, sensor.gelpad.dome_radius
     (cx, cy), (px, py), distance = camera.principal_point, camera.pixel_pitch, -camera.position[2]
@@ -121,9 +118,7 @@ def press_surface(
 ) -> GelSurface:
     """The pad under every ball as a batch of surfaces on ``grid``.
 
-    Arguments as of ``pixel_geometry``.
-
-    Raises InputError: a contact circle as wide as its ball.
+    Arguments as of ``pixel_geometry``. Raises InputError: a contact circle as wide as its ball.
     """
     on_pad = circles_on_pad(sensor, circles, ball_radius)
     share = on_pad[:, 2] / ball_radius

@@ -1,9 +1,8 @@
 """Parameters of a fit of lights: LEDs, glow of the case, response; and ties between LEDs.
 
-An LED has place, aim, lobe, height and power.
-
-A press says something only about the light that reaches it, so LEDs far from all presses are poorly known. Ties carry over from those
-nearby: LEDs of one side are of one kind, and stand mirrored about the middle of their wall.
+An LED has place, aim, lobe, height and power. A press says something only about the light that reaches it, so LEDs far from all presses
+are poorly known. Ties carry over from those nearby: LEDs of one side are of one kind, and stand mirrored about the middle of their
+wall.
 """
 
 from __future__ import annotations
@@ -26,13 +25,13 @@ SIDES = {"red": (0.0, -1.0), "green": (1.0, 0.0), "blue": (0.0, 1.0)}
 DARKEST = 0.85
 """Most of the darkest background pixel's light that may be stray."""
 CEILING = -5.1
-"""Highest z [mm] of an LED: below gel and a support plate of 1 mm, so that ``refraction.model = "slab"`` stays possible."""
+"""Highest z [mm] of an LED: below gel and a plate of 1 mm, so that a slab stays possible."""
 HEIGHT = 6
 """Column of a row of ``LightParameters.leds`` that has the height of the emitting face."""
 HEIGHTS = 0.1, 6.0
-"""Least and greatest that a fit makes it [mm]: an LED, and a light guide as high as a Mini's wall (a guess)."""
+"""Range of a fitted height [mm]: from an LED to a light guide as high as a wall (a guess)."""
 SPREAD = 1.5
-"""Width over which an LED is split, over its own: what lies in front of it, and its neighbours, make a row of them (a guess)."""
+"""Width over which an LED is split, over its own: with its neighbours a row (a guess)."""
 REFERENCE_DISTANCE = 10e-3
 """Distance [m] at which a power of 1 gives a coat facing the LED full scale."""
 
@@ -46,11 +45,12 @@ class LightParameters:
     leds: np.ndarray
     """(L, 7): x, y, z [mm], azimuth, elevation [rad], lobe, height of the emitting face [mm]."""
     power: np.ndarray
-    """(L, 3): what a coat at ``REFERENCE_DISTANCE`` that faces the LED reflects by its diffuse lobe, in full scales."""
+    """(L, 3) [full scales]: diffuse light of a coat at ``REFERENCE_DISTANCE`` facing the LED."""
     glow: np.ndarray
-    """(3,): even irradiance from the case over that of the LED at that distance, for the LEDs of each layer of ``CHANNELS``."""
+    """(3,): even irradiance from the case over that of the LED, by layer of ``CHANNELS``."""
     response: np.ndarray
-    """(6,): gamma, stray light of each channel over that of its darkest background pixel, a₁ and a₂ of the vignette 1 + a₁r² + a₂r⁴."""
+    """(6,): gamma, stray light of each channel, a₁ and a₂ of the vignette 1 + a₁r² + a₂r⁴.
+    Stray light is over that of the channel's darkest background pixel."""
 
     @classmethod
     def of(cls, sensor: SensorSpec, background: np.ndarray) -> LightParameters:
@@ -98,7 +98,7 @@ class LightParameters:
 
 
 _GLOW = np.pi * REFERENCE_DISTANCE**2
-"""An even radiance G all over the hemisphere irradiates with π G; an LED of intensity I at the distance d with I / d²."""
+"""An even radiance G irradiates with π G, an LED of intensity I at distance d with I / d²."""
 
 
 def full_scale(sensor: SensorSpec) -> np.ndarray:
@@ -128,9 +128,8 @@ def darkest(background: np.ndarray, gamma: float) -> np.ndarray:
 def leds_split(sensor: SensorSpec, count: int) -> LightsSpec:
     """Start of a fit: ``count`` LEDs in place of each of the sensor's own.
 
-    They stand side by side over ``SPREAD`` times its width.
-
-    What would stick out of the case's walls is moved inside. Raises InputError unless ``count`` is a whole number >= 1.
+    They stand side by side over ``SPREAD`` times its width. What would stick out of the case's walls is moved inside. Raises InputError
+    unless ``count`` is a whole number >= 1.
     """
     count = check_whole("split", count)
     if count == 1:
@@ -157,9 +156,8 @@ def leds_split(sensor: SensorSpec, count: int) -> LightsSpec:
 def leds_at_walls(sensor: SensorSpec, sides: str) -> LightsSpec:
     """Start of a fit: LEDs along the walls, near the gel's height.
 
-    They are aimed across the pad and towards the camera.
-
-    Raises InputError unless ``sides`` is three whole numbers >= 1 joined by commas.
+    They are aimed across the pad and towards the camera. Raises InputError unless ``sides`` is three whole numbers >= 1 joined by
+    commas.
     """
     counts = sides.split(",")
     if len(counts) != 3 or not all(count.strip().isdecimal() and int(count) for count in counts):
@@ -187,11 +185,11 @@ def leds_at_walls(sensor: SensorSpec, sides: str) -> LightsSpec:
 
 
 PLACE, AIM, LOBE, TALL, POWER = 1.0, 0.2, 1.0, 0.5, 0.2
-"""Standard deviations of LEDs about mirrored places [mm] and aims [rad], and about the lobe, height [mm] and power [full scales] of the
-LED beside them."""
+"""Standard deviations of LEDs about mirrored places [mm] and aims [rad], and about the
+lobe, height [mm] and power [full scales] of the LED beside them."""
 
 LEAST = 1.0
-"""Least distance [mm] of the middle of a layer's LEDs from the pad's, for them to be on one side of it."""
+"""Least distance [mm] of a layer's LEDs from the pad's middle, to be on one side of it."""
 
 
 @dataclass(frozen=True)
@@ -212,10 +210,8 @@ class Ties:
 def side_ties(p: LightParameters, size: int) -> Ties:
     """Ties of the LEDs of every layer, which stand on one side of the pad.
 
-    They are mirrored about the line from the pad's middle to theirs.
-
-    An LED is tied to that which lies nearest to its mirror image at the start, if that holds of both. ``size`` is the vector's length,
-    whose first entries are ``p.leds`` and ``p.power``.
+    They are mirrored about the line from the pad's middle to theirs. An LED is tied to that which lies nearest to its mirror image at
+    the start, if that holds of both. ``size`` is the vector's length, whose first entries are ``p.leds`` and ``p.power``.
     """
     rows: list[np.ndarray] = []
     offsets: list[float] = []

@@ -35,9 +35,8 @@ class Photographs:
     def settled(self, sensor: SensorSpec) -> Photographs:
         """The same with another ``background``, in whole levels.
 
-        It is the mean of it and of the presses' pixels beyond ``FAR`` radii.
-
-        One photograph of the sensor at rest holds that photograph's noise, and was taken at another time than the presses were.
+        It is the mean of it and of the presses' pixels beyond ``FAR`` radii. One photograph of the sensor at rest holds that
+        photograph's noise, and was taken at another time than the presses were.
         """
         far = self.distance(sensor)[..., None] > FAR
         total = self.background + np.where(far, self.presses, 0).sum(0)

@@ -215,9 +215,8 @@ Split = tuple[np.ndarray, np.ndarray]
 def by_press(count: int, folds: int) -> list[Split]:
     """Splits into ``folds``: fold k tests every ``folds``-th of ``count`` presses from the k-th.
 
-    So neighbours of a scan are apart.
-
-    ``folds = count`` leaves one out. Raises InputError for fewer than two folds, or more folds than presses.
+    So neighbours of a scan are apart. ``folds = count`` leaves one out. Raises InputError for fewer than two folds, or more folds than
+    presses.
     """
     if int(folds) != folds or not 2 <= folds <= count:
         raise InputError("folds", value=folds, rule=f"must be a whole number from 2 to the number of presses, {count}")
@@ -240,9 +239,7 @@ def by_half(presses: RealPresses) -> list[Split]:
 def shallow_to_deep(presses: RealPresses, share: float = 0.5) -> Split:
     """Split from the shallower ``share`` of the presses to the deeper ones.
 
-    Depth over the ball's radius grows with the circle over it.
-
-    Raises InputError for a share that leaves one side empty.
+    Depth over the ball's radius grows with the circle over it. Raises InputError for a share that leaves one side empty.
     """
     relative = _known(presses)[:, 2] / presses.ball_radius
     order, cut = np.argsort(relative, kind="stable"), round(share * len(presses))

@@ -29,7 +29,7 @@ STRENGTHS: dict[str, dict[str, float]] = {
     "tied-dark": {"prior": 300.0, "ties": 1000.0, "rest_weight": 0.1},
     "tied-darkest": {"prior": 300.0, "ties": 1000.0, "rest_weight": 0.03},
 }
-"""Values of ``FitSettings`` by name: whether LEDs of a side are tied to each other, and how much the brightness at rest is believed."""
+"""``FitSettings`` by name: ties of LEDs of a side, and weight of the brightness at rest."""
 CHOICES = {name: values for name, values in STRENGTHS.items() if values["ties"]}
 """Candidates of the choice. LEDs of a side are alike, as sensors are built so."""
 USUAL = "tied-dark"
@@ -50,9 +50,7 @@ def choose_strength(
 ) -> tuple[str, dict[str, float]]:
     """Name of the candidate chosen, and the error of each.
 
-    The error is the mean absolute residual [levels] in contacts of other halves.
-
-    Raises InputError for too few presses to halve.
+    The error is the mean absolute residual [levels] in contacts of other halves. Raises InputError for too few presses to halve.
     """
     if len(shots.circles) < 2 * FEWEST:
         rule = f"are too few to choose the strength of priors within: at least {2 * FEWEST}, or name one with --prior"

@@ -34,7 +34,7 @@ FIRST, LATER = 100, 30
 START_SPREAD = np.array([1.5, 1.5, 1.0, 0.2, 0.2, 0.5, 0.0])
 """Standard deviation of the starts: mm, rad, lobe exponent, mm."""
 STEPS = {0: 0.4, 1: 0.4, 2: 0.4, HEIGHT: 0.5}
-"""Steps [mm] of the slopes by an LED's place and height: shadows' edges are soft, and as wide on the pad."""
+"""Steps [mm] of slopes by an LED's place and height; shadows' soft edges are as wide."""
 FEWEST = 4
 """Fewest presses that a fit takes."""
 ENVS = 16
@@ -49,8 +49,8 @@ class Fitted:
     """The sensor with its new lights and response."""
     state: FitState
     costs: tuple[float, ...]
-    """Cost of the least-squares problem with the ray tracer's light before the first round and after every one; the least is taken. Without
-    rounds that with direct light alone."""
+    """Cost with the ray tracer's light before the first round and after every one.
+    The least is taken; without rounds that with direct light alone."""
     start_errors: tuple[float, ...]
     """Mean absolute residual [levels] in the contacts after direct light from every start."""
 
@@ -102,10 +102,8 @@ def extra_light(
 ) -> ExtraLight:
     """The defect, and its slopes by the LEDs' places and heights.
 
-    Slopes where shadows are cast and ``slopes`` is asked for.
-
-    Every LED has a layer of its own, so that all move in one rendering: eight more give all slopes, by central differences and without
-    inter-reflection, which changes slowly.
+    Slopes where shadows are cast and ``slopes`` is asked for. Every LED has a layer of its own, so that all move in one rendering:
+    eight more give all slopes, by central differences and without inter-reflection, which changes slowly.
     """
     lights: dict[int, Light] = {}
     if slopes and casts_shadows(problem.sensor, tracing.shadows):

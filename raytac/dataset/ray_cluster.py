@@ -1,9 +1,8 @@
 """Shards on Ray, one worker a device.
 
-The process that started the run writes all files, so that workers need no disk in common.
-
-A worker that dies loses what it was rendering; Ray starts it again, and the shard is rendered once more. Results come back through Ray's
-object store and are written here alone, so that no press is lost and none is there twice.
+The process that started the run writes all files, so that workers need no disk in common. A worker that dies loses what it was
+rendering; Ray starts it again, and the shard is rendered once more. Results come back through Ray's object store and are written here
+alone, so that no press is lost and none is there twice.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ class ShardResult:
 
     shard: int
     arrays: dict[str, np.ndarray]
-    """By name, of the presses that went well, in the order of their numbers; and those of ``SHARED``. Empty if none went well."""
+    """Arrays of presses that went well, in order, and of ``SHARED``; empty if there are none."""
     rows: list[Row]
     """One a press, failed or not: all columns of the manifest but those of the file."""
     made_by: dict[str, str | int | float]

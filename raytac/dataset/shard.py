@@ -42,7 +42,7 @@ class ShardStore:
     """The shards of one plan in a data set's folder. Only one process writes."""
 
     def __init__(self, folder: Path, plan_sha256: str, *, compress: bool = False) -> None:
-        """``plan_sha256``: of the plan that its shards must be of; ``compress``: new ones are deflated."""
+        """``plan_sha256``: of the plan that shards must be of; ``compress``: deflate new ones."""
         self.folder, self._plan, self._compress = Path(folder), plan_sha256, compress
 
     def write(self, result: ShardResult) -> ShardRecord:

@@ -1,8 +1,6 @@
 """The user's cache: what can be made again, kept between processes.
 
-A damaged entry is never used.
-
-A cache is a help and no need: one that cannot be written or read means work in memory, with a warning.
+A damaged entry is never used. A cache is a help and no need: one that cannot be written or read means work in memory, with a warning.
 """
 
 from __future__ import annotations

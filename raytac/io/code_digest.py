@@ -12,15 +12,14 @@ from functools import cache
 from pathlib import Path
 
 WITHIN = ("raytac.gel", "raytac.optics", "raytac.shapes")
-"""Packages whose modules shape a surface or an image; what a specification says goes into keys by its values, not by its code."""
+"""Packages whose code shapes a surface or an image; specifications enter keys by value."""
 
 
 def module_sources(roots: Iterable[str]) -> dict[str, Path]:
     """Source files of ``roots`` and of all modules of ``WITHIN`` that they import.
 
-    Imports inside functions count.
-
-    Roots that do not exist are left out. Imports are read from the sources; nothing is run except the ``__init__`` of packages.
+    Imports inside functions count. Roots that do not exist are left out. Imports are read from the sources; nothing is run except the
+    ``__init__`` of packages.
     """
     sources: dict[str, Path] = {}
     waiting = list(roots)

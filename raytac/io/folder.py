@@ -23,11 +23,9 @@ DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 def result_folder(out: Path, owned: Iterable[str] = ()) -> Iterator[Path]:
     """A temporary folder, whose files move into ``out`` when the block ends well.
 
-    Otherwise they are deleted, and ``out`` stays as it was.
-
-    A file of the same name in ``out`` is replaced. ``owned`` names every file that the command may write: those of an earlier run
-    that this one does not write are removed, so that a folder never mixes two runs. All others stay. ``metrics.json`` goes first and
-    comes last: where it is, the rest is complete.
+    Otherwise they are deleted, and ``out`` stays as it was. A file of the same name in ``out`` is replaced. ``owned`` names every file
+    that the command may write: those of an earlier run that this one does not write are removed, so that a folder never mixes two runs.
+    All others stay. ``metrics.json`` goes first and comes last: where it is, the rest is complete.
 
     Raises:
         InputError: ``out`` is a file or a link to nothing, its folder cannot be written, it holds a folder where a file is to be written
@@ -104,9 +102,8 @@ _KIND = "must be a file that can be written, and no link: it is the lock of the 
 class FolderLock:
     """Lock of a folder, which is made if need be.
 
-    It lasts until ``release``, the end of a ``with`` block, or the end of the process.
-
-    Only runs that ask for the lock are kept out. Where the folder did not exist and nothing is written to it, it is removed again.
+    It lasts until ``release``, the end of a ``with`` block, or the end of the process. Only runs that ask for the lock are kept out.
+    Where the folder did not exist and nothing is written to it, it is removed again.
     """
 
     def __init__(self, folder: str | Path) -> None:

@@ -1,4 +1,4 @@
-"""Optical modes. Importing this package points Dr.Jit at a libLLVM that works, before anything can import ``drjit`` itself."""
+"""Optical modes; importing them gives Dr.Jit a working libLLVM before ``drjit`` is imported."""
 
 import os as _os
 

@@ -30,7 +30,7 @@ class OpticsImages:
     depth: np.ndarray | None = None
     contact: np.ndarray | None = None
     uncovered: np.ndarray | None = None
-    """Share of each image's contact pixels, (B,), whose table bin no calibration sample reached; None where that is unknown."""
+    """Share of contact pixels (B,) whose table bin no sample reached; None where unknown."""
 
 
 class OpticalMode(Protocol):
@@ -52,7 +52,7 @@ class OpticalMode(Protocol):
 
 
 def start(mode: OpticalMode, surface: GelSurface) -> Callable[[], OpticsImages]:
-    """Begin the images of a surface, and return a function that waits for them; a mode without ``start`` renders at once."""
+    """Begin the images of a surface; returns a function that waits. A mode may lack this."""
     begin: Callable[[GelSurface], Callable[[], OpticsImages]] | None = getattr(mode, "start", None)
     if begin is not None:
         return begin(surface)
@@ -64,7 +64,7 @@ Mode = TypeVar("Mode", bound=OpticalMode)
 
 
 class OpticsConfig(Generic[Mode]):
-    """Base of the configurations of optical modes: frozen dataclasses that check themselves and build the mode.
+    """Base of optical modes' configurations: frozen, checked, and able to build the mode.
 
     .. code-block:: python
 
@@ -97,7 +97,7 @@ class OpticsConfig(Generic[Mode]):
 
     @property
     def label(self) -> str:
-        """Name for headers and reports before the mode is built: that of the class in lower case, unless it says otherwise."""
+        """Name for headers and reports before the mode is built; the class's in lower case."""
         return type(self).__name__.lower()
 
     def build(
@@ -125,7 +125,7 @@ class OpticsConfig(Generic[Mode]):
         return self.maker()(spec, self, resolution=resolution, outputs=outputs, device=device, seed=seed)
 
     def maker(self) -> Callable[..., Mode]:
-        """Class of the mode, which ``build`` calls as ``Class(spec, self, resolution=…, outputs=…, device=…, seed=…)``.
+        """Class of the mode, called with ``(spec, self, resolution, outputs, device, seed)``.
 
         It is imported in here, so that a configuration loads no renderer.
         """
@@ -135,7 +135,7 @@ class OpticsConfig(Generic[Mode]):
         """Raise at once what else the first image would, as far as that takes no renderer."""
 
     def bake(self, spec: SensorSpec, device: str) -> None:
-        """Do the work before the first image whose result is kept on disk; a comparison does not time it."""
+        """Do work before the first image that stays on disk; a comparison does not time it."""
 
     @classmethod
     def variants(cls) -> tuple[Variant, ...]:

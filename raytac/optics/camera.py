@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A pinhole at ``position`` [m] looking along +z of the pad frame, x right, y down (OpenCV convention).
+    """A pinhole at ``position`` [m], pad frame, that looks along +z, x right, y down (OpenCV).
 
     Pixel (u, v) counts from the top-left image corner, so the centre of the first pixel is (0.5, 0.5). ``focal`` = (fx, fy) and
     ``principal`` = (cx, cy) are in pixels of ``resolution`` = (width, height).
@@ -53,7 +53,7 @@ class Pinhole:
 
     @classmethod
     def from_spec(cls, spec: CameraSpec, resolution: tuple[int, int] | None = None, slab: Slab | None = None) -> Pinhole:
-        """Scale the native camera to ``resolution`` (width, height) [px]; the field of view stays that of the native image.
+        """Scale the native camera to ``resolution`` (width, height) [px]; the same field of view.
 
         With the pinhole a distance d below the gel plane, a pixel of pitch p there is the angle p / d: f = d / p. The pitch is what
         a ruler on the gel plane shows, so behind a slab d is the apparent distance: that in air plus the slab's thickness over n.
@@ -77,7 +77,7 @@ class Pinhole:
         return (u - self.principal[0]) / self.focal[0], (v - self.principal[1]) / self.focal[1]
 
     def ray(self, u: Any, v: Any) -> tuple[tuple[Any, Any, Any], tuple[Any, Any]]:
-        """(origin [m], slopes) of the ray through pixel (u, v) where it meets the coat: from the slab's face on if there is one."""
+        """(origin [m], slopes) of the ray of pixel (u, v) at the coat, behind the slab if any."""
         tx, ty = self.slope(u, v)
         if self.slab is None:
             return self.position, (tx, ty)

@@ -17,7 +17,7 @@ from raytac.specs.sensor import SensorSpec
 
 @dataclass(frozen=True)
 class Cropped(OpticsConfig[OpticalMode]):
-    """Another mode that renders a piece of its image: the same pixels as those of the whole image.
+    """Another mode that renders a piece of its image, equal to that of the whole image.
 
     Modes that need all of the image, as for shadows of a table, and modes of one's own render it and cut.
     """
@@ -49,7 +49,7 @@ class Cropped(OpticsConfig[OpticalMode]):
         self.config.bake(spec, device)
 
     def build(self, spec: SensorSpec, *, resolution: tuple[int, int] | None = None, **options: Any) -> OpticalMode:
-        """The mode; arguments and errors as of ``OpticsConfig.build``, and ``InputError`` for a crop beyond the image."""
+        """The mode. Raises as ``OpticsConfig.build``, and ``InputError`` for a crop too large."""
         whole = spec.camera.resolution if resolution is None else resolution
         left, top, width, height = self.crop
         inside = min(left, top) >= 0 and min(width, height) >= 1 and left + width <= whole[0] and top + height <= whole[1]

@@ -1,4 +1,4 @@
-"""From heights on the device to the images that a learner observes, on the same device: cut, averaged, compared with the image at rest."""
+"""Heights on the device to a learner's images: cut, averaged, compared with that at rest."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ImageCut:
 
 
 class DeviceImage:
-    """Renders with one optical mode and cuts on the device; nothing leaves it. One recording a batch size, as the modes have."""
+    """One optical mode whose images are cut on the device; one recording a batch size."""
 
     def __init__(self, mode: Any, grid: PadGrid, cut: ImageCut, *, difference: bool) -> None:
         """Render the pad at rest once, which prepares the mode for its grid.
@@ -69,7 +69,7 @@ class DeviceImage:
         return upload(self.mi, surface)
 
     def __call__(self, heights: Float, contact: UInt8 | None = None) -> Any:
-        """Images (B, height, width, 3), uint8, a Dr.Jit tensor that DLPack hands on without a copy; they are there when this returns.
+        """Images (B, height, width, 3), uint8, complete: a Dr.Jit tensor that DLPack hands on.
 
         Args:
             heights: [m], B·Ny·Nx of them on this device, finite, which is not checked: a Dr.Jit array, or a float32 PyTorch tensor.
@@ -94,7 +94,7 @@ class DeviceImage:
 
     @staticmethod
     def _array(values: Any, kind: Any) -> Any:
-        """A tensor of another library as an array on this device, without a copy where it is on it already."""
+        """A tensor of another library as an array on this device; copied only if it is elsewhere."""
         tensor: Any = dr.tensor_t(kind)
         return values if values is None or isinstance(values, kind) else tensor(values).array
 

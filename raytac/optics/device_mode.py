@@ -1,4 +1,4 @@
-"""``DeviceMode``: what all our optical modes share. Dr.Jit code over arrays of all environments, recorded once a batch size."""
+"""``DeviceMode``: Dr.Jit code that optical modes share, recorded once a batch size."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ Float = Any  # Dr.Jit array of float32
 UInt8 = Any  # Dr.Jit array of bytes
 
 ROUNDING = 2
-"""Dr.Jit's allocator rounds every array up to a power of two of bytes, so that it takes at most twice its size."""
+"""Largest size of an array over its own: Dr.Jit's allocator takes powers of two of bytes."""
 _LONGEST_ARRAY = 2**32 - 1
 """Dr.Jit indexes with 32 bits."""
 
 
 @dataclass(frozen=True)
 class FrameInputs:
-    """Every device array that a recorded frame reads besides the surface; Dr.Jit wants them named as inputs."""
+    """Device arrays besides the surface that a recorded frame reads; Dr.Jit wants them named."""
 
     rest: Float
     """Heights at rest [m], Ny·Nx."""
@@ -81,7 +81,7 @@ class DeviceMode(ABC):
         device: str = "auto",
         seed: int = 0,
     ) -> None:
-        """Build what does not depend on the surface's grid; arguments and errors as of ``OpticsConfig.build``."""
+        """Build what is independent of the grid; arguments and errors as of ``OpticsConfig.build``."""
         outputs = check_names("outputs", outputs, config.outputs)
         least = self._smallest_side
         if resolution is not None and (len(resolution) != 2 or min(resolution) < least):
@@ -104,10 +104,10 @@ class DeviceMode(ABC):
         self._set_up()
 
     def _set_up(self) -> None:  # noqa: B027 (a mode may need nothing more)
-        """Last part of the constructor: what a mode needs beyond that, and checks of its configuration."""
+        """Last part of the constructor: what else a mode needs, and checks of its configuration."""
 
     def crop(self, piece: tuple[int, int, int, int]) -> bool:
-        """Render only a piece of the image from now on, (left, top, width, height) [px]; False if all of it would be computed anyway.
+        """Render only (left, top, width, height) [px] from now on; False if all is computed anyway.
 
         What is rendered equals the same piece of the whole image. Called before the first frame.
         """
@@ -130,7 +130,7 @@ class DeviceMode(ABC):
         raise NotImplementedError
 
     def _other_images(self, frame: DeviceFrame, failed: np.ndarray) -> dict[str, Any]:
-        """Fields of ``OpticsImages`` besides ``rgb`` that show light; ``failed`` (B,) marks environments."""
+        """Fields of ``OpticsImages`` besides ``rgb`` that show light; ``failed`` (B,) is a mask."""
         return {}
 
     def _bytes_per_env(self, grid: PadGrid) -> int:
@@ -165,7 +165,7 @@ class DeviceMode(ABC):
         return ROUNDING * max(seen, self._bytes_per_env(grid))
 
     def largest_batch(self, grid: PadGrid) -> int:
-        """Largest number of environments that one call may render on ``grid``; a path tracer's images are made one by one."""
+        """Most environments of one call on ``grid``; a path tracer's images are made one by one."""
         width, height = self.camera.size
         longest = max(4 * grid.rest.size, self._longest_row * width * height)
         return min(self._memory // max(self.memory_per_env(grid), 1), _LONGEST_ARRAY // longest)
@@ -190,9 +190,8 @@ class DeviceMode(ABC):
     def render(self, surface: GelSurface) -> OpticsImages:
         """Render every environment of ``surface``; see ``OpticsImages`` for the shapes.
 
-        Untouched pads are not rendered again: they show the image at rest, which is rendered once.
-
-        An environment whose heights are not finite fails alone: its ``rgb`` is 0, its other images are NaN, its contact is False.
+        Untouched pads are not rendered again: they show the image at rest, which is rendered once. An environment whose heights are not
+        finite fails alone: its ``rgb`` is 0, its other images are NaN, its contact is False.
 
         Raises:
             InputError: a surface whose arrays do not have the shape of its grid, an empty batch, one too large, or a second grid.
@@ -200,7 +199,7 @@ class DeviceMode(ABC):
         return self.start(surface)()
 
     def start(self, surface: GelSurface) -> Callable[[], OpticsImages]:
-        """Begin ``render``, and return a function that waits for the images and copies them to the host.
+        """Begin ``render``; returns a function that waits for the images and copies them back.
 
         Dr.Jit computes them beside what the caller does next. At most one call is under way: the next one waits for it. Dr.Jit lets
         only the thread that launched a kernel wait for it, so in another thread the function renders the surface again.
@@ -238,7 +237,7 @@ class DeviceMode(ABC):
         return images
 
     def _pressed(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> list[int]:
-        """Environments that have to be rendered, as many as some power of two; the others show the image at rest.
+        """Environments to render, as many as some power of two; others show the image at rest.
 
         Marker dots may lie differently in every environment, so with dots it is all of them.
         """
@@ -251,7 +250,7 @@ class DeviceMode(ABC):
         return rounded if len(rounded) < surface.batch else list(range(surface.batch))
 
     def _begun(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> Callable[[], OpticsImages]:
-        """Launch the images of heights (B, Ny, Nx) that are safe to trace; the function that is returned waits for them."""
+        """Launch the images of heights (B, Ny, Nx) safe to trace; returns a function that waits."""
         lit = seen = None
         if self._lit:
             lit = self.render_device(self._upload(heights), self._upload_contact(surface, failed), self._upload_ink(surface))
@@ -260,7 +259,7 @@ class DeviceMode(ABC):
         return partial(self._images, surface, failed, lit, seen)
 
     def render_device(self, heights: Float, contact: UInt8 | None = None, ink: Float | None = None) -> DeviceFrame:
-        """Images on the device, of device arrays; recorded at the first call of a batch size and replayed afterwards.
+        """Images on the device, of device arrays; recorded once a batch size, then replayed.
 
         Args:
             heights: of the coat [m], B·Ny·Nx; must be finite, which is not checked here.
@@ -298,7 +297,7 @@ class DeviceMode(ABC):
         return OpticsImages(**images)
 
     def _recorded(self, function: Callable[..., Any], heights: Float, contact: UInt8 | None, ink: Float | None) -> Any:
-        """``function(heights, contact, inputs)``, recorded once for each number of environments and replayed afterwards."""
+        """``function(heights, contact, inputs)``, recorded once for each number of environments."""
         key = function.__name__, ink is not None, dr.width(heights)
         if key not in self._frozen:
             self._frozen[key] = dr.freeze(function)
@@ -324,7 +323,7 @@ class DeviceMode(ABC):
             raise InputError(name, value=kind, rule=f"must be a uint8 image of shape {wanted}")
 
     def _checked(self, surface: GelSurface) -> tuple[np.ndarray, np.ndarray]:
-        """Heights (B, Ny, Nx) float32 that are safe to trace, with failed environments at rest, and which those are (B,)."""
+        """Heights (B, Ny, Nx) float32, failed environments at rest, and which those are (B,)."""
         if surface.batch < 1:
             raise InputError("surface.height", value=surface.height.shape, rule="must have at least one environment")
         self._check_batch(surface.batch, surface.grid)
@@ -381,7 +380,7 @@ def upload(mi: Any, surface: GelSurface) -> tuple[Float, UInt8]:
 
 
 def device_envs(nodes: int, heights: Float, **others: Any) -> int:
-    """Number of environments B in device heights (B·``nodes``); raise InputError unless each of ``others`` has one value a node too."""
+    """B of device heights (B·``nodes``). Raises InputError unless ``others`` are as many values."""
     width = dr.width(heights)
     if width == 0 or width % nodes:
         raise InputError("heights", value=width, rule=f"must hold a whole number of grids of {nodes} nodes")

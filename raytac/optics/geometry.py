@@ -1,4 +1,4 @@
-"""Geometry below all optical modes: the coat as a height field on the device, camera rays on it, normals, depth, shadow rays.
+"""Geometry below all optical modes: the coat's height field, camera rays, normals, shadows.
 
 The reference integrator traces the triangles of this surface. The fast one needs no acceleration structure for it: the surface is
 a height field over a regular grid, camera rays are near the grid's normal and shadow rays leave the thin slab of the imprint after
@@ -19,21 +19,21 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.camera import Pinhole
 
 TILE = 0.5e-3
-"""Edge of a tile of the bounds map [m]. The bounds on z hold two edges around a place: a camera ray of slope t may be that over t above
-or below the height where its tile is looked up, 2.8 mm for the Mini's steepest ray. The bound on the indentation holds one edge."""
+"""Edge of a tile of the bounds map [m]; the bound on the indentation holds one edge.
+Bounds on z hold two: a camera ray of slope t may be that over t off its tile's height, 2.8 mm for the Mini's steepest ray."""
 LOOK_UP_Z = -1.0e-3
 """Height at which a camera ray looks up its tile [m]: between rest and a deep press."""
 
 
 def bilinear(corners: Sequence[Any], wx: Any, wy: Any) -> Any:
-    """Bilinear mean of a cell's ``corners`` (``NodeGrid.corners``) at the shares ``wx`` and ``wy`` of its sides."""
+    """Bilinear mean of a cell's ``corners`` at the shares ``wx`` and ``wy`` of its sides."""
     a, b, c, d = corners
     return dr.lerp(dr.lerp(a, b, wx), dr.lerp(c, d, wx), wy)
 
 
 @dataclass(frozen=True)
 class NodeGrid:
-    """Nodes over the pad, row by row: their numbers, the place of the first and the spacing [m]. Device arrays hold B of them in turn."""
+    """Nodes over the pad, row by row: numbers, first place, spacing [m]; B times in arrays."""
 
     nx: int
     ny: int
@@ -43,18 +43,18 @@ class NodeGrid:
     dy: float
 
     def cell(self, mi: Any, env: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
-        """Index of the first corner of the cell under (x, y) [m], and the shares of its sides at which that lies."""
+        """First corner of the cell under (x, y) [m], and the shares of its sides at that place."""
         fx = dr.clip((x - self.x0) / self.dx, 0, self.nx - 1.001)
         fy = dr.clip((y - self.y0) / self.dy, 0, self.ny - 1.001)
         ix, iy = mi.UInt32(fx), mi.UInt32(fy)
         return (env * self.ny + iy) * self.nx + ix, fx - mi.Float(ix), fy - mi.Float(iy)
 
     def corners(self, kind: Any, values: Any, i: Any) -> list[Any]:
-        """``values``, packets of the type ``kind``, at the four corners of the cells that start at ``i``."""
+        """``values``, packets of type ``kind``, at the corners of the cells that start at ``i``."""
         return [dr.gather(kind, values, i + offset) for offset in (0, 1, self.nx, self.nx + 1)]
 
     def slopes(self, mi: Any, z: Any, i: Any, ix: Any, iy: Any) -> tuple[Any, Any]:
-        """(∂z/∂x, ∂z/∂y) at node ``i``, of column ``ix`` and row ``iy``; central differences, one-sided on the rim."""
+        """(∂z/∂x, ∂z/∂y) at node ``i`` (column ``ix``, row ``iy``); one-sided on the rim."""
         nx = self.nx
         x_minus, x_plus = dr.select(ix > 0, i - 1, i), dr.select(ix < nx - 1, i + 1, i)
         y_minus, y_plus = dr.select(iy > 0, i - nx, i), dr.select(iy < self.ny - 1, i + nx, i)
@@ -98,7 +98,7 @@ class CoatField:
 
     @staticmethod
     def memory_per_env(layout: CoatLayout) -> int:
-        """Bytes of one surface: normals and corners of every node, and three bounds of the tiles by rows, then by columns, then spread."""
+        """Bytes of one surface: normals and corners of every node, and the tiles' bounds."""
         g = layout
         return 32 * g.nx * g.ny + 12 * g.ny * g.tiles_x + 24 * g.tiles_x * g.tiles_y
 
@@ -123,7 +123,7 @@ class CoatField:
         return (env * g.tiles_y + ty) * g.tiles_x + tx
 
     def camera_hit(self, env: Any, origin: tuple[Any, Any, Any], tx: Any, ty: Any) -> Any:
-        """First meeting of the camera ray origin + s (tx, ty, 1) with the surface; returns the point. The origin may differ by pixel.
+        """First point of the ray origin + s (tx, ty, 1) on the surface; origins may differ by pixel.
 
         The tile's bounds bracket the hit; the bracket is walked in steps of one cell until the ray is behind the surface, then
         refined by the secant rule (bilinear patches are nearly linear along so short a way).
@@ -159,7 +159,7 @@ class CoatField:
         return mi.Point3f(ox + (z - oz) * tx, oy + (z - oz) * ty, z)
 
     def visibility(self, env: Any, p: Any, light: Any, tan_half: Any, active: Any) -> Any:
-        """Share of an emitter at ``light`` that point ``p`` of the surface sees past the surface itself, in [0, 1].
+        """Share of an emitter at ``light`` seen from ``p`` past the surface itself, in [0, 1].
 
         Walks the shadow ray cell by cell and keeps the smallest clearance angle. ``tan_half`` is half the emitter's extent seen
         from ``p`` across the ray in the vertical plane: between −tan_half and +tan_half the share grows linearly, which is exact for
@@ -202,7 +202,7 @@ class CoatField:
 
 
 def pack_nodes(mi: Any, g: CoatLayout, height: Any) -> Any:
-    """(z, n_x, n_y, n_z) at every node of ``height`` (B·Ny·Nx); central differences, one-sided on the pad's rim."""
+    """(z, n_x, n_y, n_z) at nodes of ``height`` (B·Ny·Nx); one-sided differences on the rim."""
     i = dr.arange(mi.UInt32, dr.width(height))
     zx, zy = g.slopes(mi, height, i, i % g.nx, (i // g.nx) % g.ny)
     inv = dr.rsqrt(zx * zx + zy * zy + 1)
@@ -210,7 +210,7 @@ def pack_nodes(mi: Any, g: CoatLayout, height: Any) -> Any:
 
 
 def pack_cells(mi: Any, g: CoatLayout, height: Any) -> Any:
-    """The four corners of the cell right of and below every node: one packet gather where a walk would need four."""
+    """Four corners of the cell right of and below every node, for one gather instead of four."""
     i = dr.arange(mi.UInt32, dr.width(height))
     right, down = dr.select(i % g.nx < g.nx - 1, 1, 0), dr.select((i // g.nx) % g.ny < g.ny - 1, g.nx, 0)
     corners = (0, right, down, right + down)
@@ -218,7 +218,7 @@ def pack_cells(mi: Any, g: CoatLayout, height: Any) -> Any:
 
 
 def bounds_map(mi: Any, g: CoatLayout, rest: Any, height: Any) -> tuple[Any, Any, Any]:
-    """Per tile: lowest and highest z of the 5 × 5 tiles around it, deepest indentation of the 3 × 3; each (B·tiles_y·tiles_x) [m]."""
+    """Lowest and highest z of 5 × 5 tiles, deepest of 3 × 3; each (B·tiles_y·tiles_x) [m]."""
     envs = dr.width(height) // (g.nx * g.ny)
     rows = dr.arange(mi.UInt32, envs * g.ny * g.tiles_x)
     tx, row = rows % g.tiles_x, rows // g.tiles_x
@@ -254,7 +254,7 @@ def bounds_map(mi: Any, g: CoatLayout, rest: Any, height: Any) -> tuple[Any, Any
 
 @dataclass(frozen=True)
 class PixelSample:
-    """Hit of one camera ray per pixel, in the pad frame: environment, point, normal, direction to the camera."""
+    """Camera ray hit of every pixel, pad frame: environment, point, normal, direction back."""
 
     env: Any
     p: Any
@@ -282,7 +282,7 @@ def see(mi: Any, field: CoatField, camera: Pinhole, envs: int, jitter: tuple[flo
 
 
 def seen_images(p: Any, n: Any, surface: GelSurface, camera: Pinhole, outputs: Sequence[str]) -> dict[str, np.ndarray]:
-    """Contact, and as ``outputs`` say normals with positions, and depth, of the seen points ``p`` and normals ``n`` on the device."""
+    """Contact, and as ``outputs`` say normals, positions and depth, of points and normals."""
     width, height = camera.size
     shape, grid = (surface.batch, height, width), surface.grid
     points = np.array(p).T.reshape(*shape, 3)

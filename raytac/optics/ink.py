@@ -1,4 +1,4 @@
-"""Dots on the coat in an image: the ink's share at a point of the skin, and what it does to light and to an encoded level."""
+"""Dots on the coat in an image: the ink's share of the skin, and its effect on light."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from raytac.optics.geometry import CoatLayout, bilinear
 from raytac.specs.sensor import SensorSpec
 
 SPECULAR = 0.57
-"""q of ``darkened``. From the reference integrator on the untouched Mini with 7 x 9 dots, 64 samples a pixel: a dot of albedo 0.05 on a
-coat of 0.5 with s = 0.15 returns 0.25 of the coat's light (mean of channels and dots; 0.20 to 0.38 across the pad; 2026-11-21, the Mini
-of that day). Where s = 0, as in the shipped sensors, q does not matter."""
+"""q of ``darkened``, from the reference integrator on the untouched Mini with 7 x 9 dots.
+With 64 samples a pixel a dot of albedo 0.05 on a coat of 0.5 with s = 0.15 returns 0.25 of the coat's light (mean of channels and
+dots; 0.20 to 0.38 across the pad; 2026-11-21). Where s = 0, as in the shipped sensors, q does not matter."""
 
 
 def checked_ink(surface: GelSurface) -> np.ndarray | None:
@@ -34,18 +34,18 @@ def checked_ink(surface: GelSurface) -> np.ndarray | None:
 
 
 def ink_at(mi: Any, layout: CoatLayout, ink: Any, env: Any, x: Any, y: Any) -> Any:
-    """Share of ink at the points (x, y) [m] of environments ``env``, bilinear; ``ink`` is (B·Ny·Nx) on the device."""
+    """Share of ink at points (x, y) [m] of environments ``env``, bilinear in ``ink`` (B·Ny·Nx)."""
     i, wx, wy = layout.cell(mi, env, x, y)
     return bilinear(layout.corners(mi.Float, ink, i), wx, wy)
 
 
 def inked_albedo(sensor: SensorSpec, ink: Any) -> list[Any]:
-    """Diffuse albedo of the three channels where this share is ink; the specular lobe is that of the coat, dots or not."""
+    """Diffuse albedo of the channels where this share is ink; the specular lobe is the coat's."""
     return [r + (sensor.markers.reflectance - r) * ink for r in sensor.coat.reflectance]
 
 
 def darkened(sensor: SensorSpec, levels: list[Any], ink: Any) -> list[Any]:
-    """Image levels (0-255, three channels) of a plain coat with dots printed on it, for modes that know levels and no light.
+    """Levels (0-255, three channels) of a plain coat with dots, for modes that know no light.
 
     In linear light x = (level / 255)^γ less the black level, a dot returns the share ((1 − s) ρ_dot + s q) / ((1 − s) ρ + s q) of what the
     coat does; q is what the specular lobe, of weight s, sends to the camera beside a white diffuse coat.

@@ -1,4 +1,4 @@
-"""Refraction at the flat face between the air around camera and LEDs and the gel with its plate: bending, loss, and how a beam spreads.
+"""Refraction at the flat face between air and gel: bending, loss, and spread of a beam.
 
 Gel and support plate are one medium of index n above the plane z = z_i, air lies below. A ray at the angle θ₁ to the normal in air
 and θ₂ in the gel obeys sin θ₁ = n sin θ₂ (Snell), so with slopes t = tan θ:
@@ -22,35 +22,35 @@ from raytac.specs.sensor import SensorSpec
 from raytac.specs.sensor_check import check_slab
 
 STEPS = 5
-"""Newton steps of ``Slab.meet``: enough for float32 at any angle (a test compares with bisection)."""
+"""Newton steps of ``Slab.meet``: enough for float32 at any angle (by a test)."""
 
 
 @dataclass(frozen=True)
 class Link:
-    """The path of light from a point y to a point x, possibly over the interface; all Dr.Jit arrays."""
+    """The path of light from y to x, possibly over the interface; all Dr.Jit arrays."""
 
     w: Any
     """Unit direction at x from where the light comes."""
     out: Any
     """Unit direction in which the light leaves y."""
     gain: Any
-    """Irradiance at x perpendicular to w for unit intensity at y [1/m² or 1/unit²]; Fresnel's loss included."""
+    """Irradiance at x perpendicular to w for unit intensity at y [1/m² or 1/unit²], with loss."""
     via: Any
     """Point of the interface that the light crosses or is mirrored at."""
     bent: Any
-    """True if the path has two legs, x to ``via`` and ``via`` to y; else it is one straight line."""
+    """True if the path has two legs, x to ``via`` and ``via`` to y; else it is straight."""
 
 
 @dataclass(frozen=True)
 class Slab:
-    """Gel and plate of index ``ior`` above the plane at height ``z`` (in whatever unit the points are in), air of index 1 below."""
+    """Gel and plate of index ``ior`` above height ``z`` (the points' unit), air (1) below."""
 
     z: float
     ior: float
 
     @classmethod
     def from_spec(cls, sensor: SensorSpec, unit: float = 1.0) -> Slab | None:
-        """The slab in a world of ``unit`` length units per metre; None without refraction; SpecError unless camera and LEDs lie below."""
+        """The slab, ``unit`` units a metre, or None; SpecError unless camera and LEDs lie below."""
         if sensor.refraction.model == "none":
             return None
         check_slab(sensor)
@@ -66,11 +66,11 @@ class Slab:
         return tx * scale, ty * scale
 
     def transmittance(self, mi: Any, cos_air: Any) -> Any:
-        """Fresnel transmittance T for unpolarised light whose ray in air makes this cosine (> 0) with the normal; equal both ways."""
+        """Fresnel transmittance T, unpolarised, for this cosine (> 0) in air; equal both ways."""
         return 1 - mi.fresnel(cos_air, self.ior)[0]
 
     def refract(self, mi: Any, d: Any) -> tuple[Any, Any]:
-        """(unit direction behind the plane, Fresnel reflectance) of a ray of unit direction ``d`` on either side, going to the plane.
+        """(direction behind the plane, Fresnel reflectance) of unit ``d``, from either side.
 
         Under total internal reflection the reflectance is 1 and the direction has no meaning.
         """
@@ -79,7 +79,7 @@ class Slab:
         return dr.normalize(mi.Vector3f(d.x * eta_ti, d.y * eta_ti, -cos_t)), reflectance
 
     def meet(self, rho: Any, h1: Any, h2: Any) -> Any:
-        """t = tan θ₁ of the ray that covers the horizontal distance ``rho`` over the heights ``h1`` in air and ``h2`` in the gel.
+        """t = tan θ₁ of the ray that goes ``rho`` across over heights ``h1`` in air, ``h2`` in gel.
 
         Root of f(t) = h₁ t + h₂ t / √(n² + (n² − 1) t²) − ρ. f increases and is concave, so Newton's iteration climbs to the root
         without overshooting from any start left of it; both bounds of f from above, h₂ t / n and h₂ / √(n² − 1) for the second term,
@@ -113,9 +113,9 @@ class Slab:
         return cos1, cos2, slide, 1 / ((h1 / cos1 + h2 / (n * cos2)) * cos2 * slide)
 
     def connect(self, mi: Any, p: Any, light: Any) -> tuple[Link, Any]:
-        """The refracted path from ``light`` in air to ``p`` in the gel, and dθ₂/ds: how fast its angle at p turns as the light moves.
+        """The refracted path from ``light`` in air to ``p`` in the gel, and dθ₂/ds at p.
 
-        s is the way of the light perpendicular to its ray in the plane of incidence; dρ = ds / cos θ₁ and dθ₂ = cos θ₁ / (n cos θ₂) dθ₁.
+        ds moves the light perpendicular to its ray in the plane of incidence; dρ = ds / cos θ₁ and dθ₂ = cos θ₁ / (n cos θ₂) dθ₁.
         """
         d = light - p
         rho = dr.sqrt(dr.maximum(d.x * d.x + d.y * d.y, 1e-24))
@@ -132,7 +132,7 @@ class Slab:
         return link, 1 / (self.ior * cos2 * slide)
 
     def link(self, mi: Any, x: Any, y: Any) -> Link:
-        """Light from ``y`` to ``x`` wherever both lie: straight within one medium, refracted between the two.
+        """Light from ``y`` to ``x``: straight within one medium, refracted between the two.
 
         From gel to air the spread follows from étendue, dA₁ dΩ₁ = n² dA₂ dΩ₂: it is that of the other way over n².
         """
@@ -154,7 +154,7 @@ class Slab:
         )
 
     def mirror(self, mi: Any, x: Any, y: Any) -> Link:
-        """Light from ``y`` to ``x``, both in air, by the plane's reflection: as from y's mirror image, times Fresnel's reflectance."""
+        """Light from ``y`` to ``x`` in air by the plane's mirror, times Fresnel's reflectance."""
         d = mi.Point3f(y.x, y.y, 2 * self.z - y.z) - x
         r2 = dr.maximum(dr.squared_norm(d), 1e-12)
         w = d * dr.rsqrt(r2)

@@ -21,7 +21,7 @@ register = OPTICS.register
 
 
 def chosen_optics(choice: str | OpticsConfig[Any] | OpticalMode) -> OpticsConfig[Any]:
-    """Configuration of a name, the configuration itself, or one that holds a mode that is built already.
+    """Configuration of a name or of a built mode; a configuration is returned as it is.
 
     Raises InputError: an unknown name, or an object of another kind.
     """

@@ -1,4 +1,4 @@
-"""The camera's response: from linear radiance to the 8-bit image, a real image as flat field, and the exposure that makes mid-grey."""
+"""The camera's response: radiance to 8-bit image, flat field, and mid-grey exposure."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from raytac.optics.camera import Pinhole
 from raytac.specs.sensor import ResponseSpec, SensorSpec, shading_degree
 
 SATURATED = 0.05
-"""Share of pixels at full scale above which an image at rest counts as saturated: shipped sensors have none."""
+"""Share of pixels at full scale above which an image at rest counts as saturated."""
 _LIMITS = (1e-9, 1e9)
 """Exposures that are looked at; the upper one is the largest that a file may have."""
 _STEPS = 60
 
 
 class Response:
-    """u8 = round(255 · clip(white balance · exposure · vignette · shading · L + black)^(1/γ)), one formula for device and host."""
+    """u8 = 255 · clip(white balance · exposure · vignette · shading · L + black)^(1/γ), rounded."""
 
     def __init__(self, spec: ResponseSpec, camera: Pinhole) -> None:
         self.spec = spec
@@ -36,7 +36,7 @@ class Response:
         self.black = np.asarray(spec.black_level, dtype=np.float32)
 
     def set_flat_field(self, background: np.ndarray, at_rest: np.ndarray) -> None:
-        """From now on turn the radiance ``at_rest`` (H, W, 3) into the real ``background`` (uint8), in linear light.
+        """Turn radiance ``at_rest`` (H, W, 3) into the real ``background`` (uint8) from now on.
 
         Raises InputError: a pixel that no light reaches at rest.
         """
@@ -48,7 +48,7 @@ class Response:
         self.scale = (target / at_rest).astype(np.float32)
 
     def encode(self, mi: Any, linear: list[Any], scale: list[Any]) -> Any:
-        """8-bit values, interleaved RGB (N·3), of three device arrays of B·H·W radiances; ``scale`` as ``device_scale`` gives it."""
+        """8-bit RGB (N·3) of three device arrays (B·H·W) of radiances; ``scale``: ``device_scale``."""
         n = dr.width(linear[0])
         i = dr.arange(mi.UInt32, n)
         pixel = i % dr.width(scale[0])
@@ -72,7 +72,7 @@ class Response:
 
 
 def mid_grey_exposure(sensor: SensorSpec, signal: np.ndarray) -> float:
-    """Exposure at which the brightest channel's mean over the image at rest is half of full scale, to four digits.
+    """Exposure at which the brightest channel's mean at rest is half of full scale.
 
     e solves max_c mean_p clip(e · s_pc + b_c, 0, 1)^(1/γ) = 1/2 over channels c and pixels p, by bisection: the left side rises with e.
 
@@ -103,14 +103,16 @@ def saturated_share(rgb: np.ndarray) -> float:
 
 
 def shading_gain(shading: Sequence[Sequence[float]], resolution: tuple[int, int]) -> np.ndarray:
-    """Gain (H, W, C) of every pixel for the coefficients of C channels (``ResponseSpec.shading_red``; none is a gain of 1) at
-    ``resolution`` (width, height)."""
+    """Gain (H, W, C) at ``resolution`` (width, height) by the coefficients of C channels.
+
+    They are as ``ResponseSpec.shading_red``; none is a gain of 1.
+    """
     x, y = (_centres(n) for n in resolution)
     return np.exp(np.stack([chebyshev.chebgrid2d(x, y, _table(c)).T for c in shading], -1))
 
 
 def fit_log_gain(gain: np.ndarray, weight: np.ndarray, degree: int, *, ridge: float = 0.0) -> tuple[float, ...]:
-    """Coefficients of the polynomial of this degree that is nearest to log ``gain`` (H, W) > 0 with weights (H, W) on squared residuals.
+    """Coefficients of the polynomial nearest to log ``gain`` (H, W) > 0 with weights (H, W).
 
     ``ridge`` pulls every coefficient to 0, relative to all weights together: it holds a fit where pixels without weight leave it free.
     """

@@ -38,7 +38,7 @@ def load_mitsuba(device: str = "auto") -> tuple[Any, str]:
 
 
 def _started(mi: Any, device: str, name: str) -> str:
-    """The device whose variant is set in ``mi``: ``name``, or another one that ``device = "auto"`` may fall back to."""
+    """The device whose variant is set in ``mi``: ``name``, or what ``auto`` falls back to."""
     # A variant that could be set and did not trace is still set, and nothing renders with it.
     current = None if mi.variant() == getattr(mi, "raytac_failed_variant", None) else mi.variant()
     active = next((known for known, variant in VARIANTS.items() if variant == current), None)
@@ -64,7 +64,7 @@ def _started(mi: Any, device: str, name: str) -> str:
 
 
 def _try_variant(mi: Any, variant: str, *, trace: bool = False) -> str:
-    """Set the variant, trace one ray if asked, and return why that failed, or nothing; a failure is noted in ``mi``.
+    """Set the variant, trace a ray if asked, and return why that failed, noted in ``mi``.
 
     A CUDA whose libraries load may still not trace: no kernel image for the card, no OptiX in a container, a driver that is too old.
     """
@@ -95,7 +95,7 @@ def _require_llvm() -> None:
 
 @contextmanager
 def no_collection() -> Iterator[None]:
-    """Keep Python's garbage collector from running inside the block, where Dr.Jit may record kernels.
+    """Keep Python's garbage collector out of the block, where Dr.Jit may record kernels.
 
     An array made from NumPy memory on the CPU returns it by a host callback when it is freed. If the collector frees one while a frozen
     function is recorded, Dr.Jit 1.5 aborts the process ("enqueue_host_func(): this function cannot be recorded!"). Only reference
@@ -111,7 +111,7 @@ def no_collection() -> Iterator[None]:
 
 
 def peak_bytes(call: Callable[[], object], device: str) -> int:
-    """Most bytes that Dr.Jit's arrays took during ``call`` beyond those that it held before; 0 if ``call`` uses no Dr.Jit.
+    """Most bytes of Dr.Jit's arrays during ``call`` beyond those before; 0 without Dr.Jit.
 
     The allocator's cache is emptied first, so that memory kept from earlier work does not hide what the call needs; that makes the next
     calls slower. Acceleration structures of the ray tracer (Embree, OptiX) are not Dr.Jit arrays and not counted.

@@ -1,9 +1,7 @@
 """Error of an 8-bit image against a reference: MAE, RMSE, PSNR, SSIM and FLIP.
 
-Over the frame or a part of it.
-
-Images are RGB as the camera writes them: (H, W, 3), uint8, the gamma of the sensor's response in them. docs/comparison.md defines every
-figure once more in words.
+Over the frame or a part of it. Images are RGB as the camera writes them: (H, W, 3), uint8, the gamma of the sensor's response in them.
+docs/comparison.md defines every figure once more in words.
 """
 
 from __future__ import annotations
@@ -20,11 +18,11 @@ METRICS = ("mae", "rmse", "psnr", "ssim", "flip")
 RING_WIDTH = 2e-3
 """Width of the shadow ring round the contact, measured on the gel plane [m]."""
 SSIM_SIGMA = 1.5
-"""Standard deviation of SSIM's Gaussian window [px]; the window is 11 pixels wide (Wang et al. 2004, section III.B)."""
+"""Standard deviation of SSIM's 11-pixel Gaussian window [px] (Wang et al. 2004, III.B)."""
 SSIM_BORDER = 5
-"""Half the window [px]: nearer to the edge of the image the window would need pixels that are not there."""
+"""Half the window [px]: nearer to the image's edge it would lack pixels."""
 FLIP_PPD = 67.0206
-"""Pixels per degree of visual angle: 0.7 m before a display 0.7 m and 3840 pixels wide, FLIP's own default (Andersson et al. 2020)."""
+"""Pixels per degree, FLIP's default: 0.7 m before 0.7 m of 3840 pixels (Andersson 2020)."""
 
 
 def rmse(a: np.ndarray, b: np.ndarray) -> float:
@@ -141,9 +139,7 @@ def regions(contact: np.ndarray, pixel_pitch: tuple[float, float], ring_width: f
 def error_maps(image: np.ndarray, reference: np.ndarray, *, flip: bool | None = None) -> dict[str, np.ndarray]:
     """Maps (H, W): ``absolute`` and ``squared`` [levels], ``ssim`` and ``flip``.
 
-    Every region's figures are means of them.
-
-    ``flip``: None is with FLIP if its package is there, True asks for it.
+    Every region's figures are means of them. ``flip``: None is with FLIP if its package is there, True asks for it.
 
     Raises:
         InputError: images that are not uint8 (H, W, 3) of one shape.

@@ -56,7 +56,7 @@ class MotionReport:
     fit_errors: list[ModelError]
     """Errors of FOTS, and of FOTS as published, on the presses that both were fitted to."""
     by_press: list[tuple[str, ModelError]]
-    """Errors of FOTS by press, described in words, under its last kind of load; presses of the fit first."""
+    """Errors of FOTS by press, in words, under its last kind of load; those of the fit first."""
     times_ms: dict[str, float]
     """Median time of a frame of every model at the probes [ms]."""
     probes: int
@@ -68,9 +68,8 @@ def run_calibrate_markers(
 ) -> list[Path]:
     """Press the soft pad, fit, test on held-out presses, and write ``FILES`` to ``out``.
 
-    Returns the files written.
-
-    Finished presses are kept in ``presses`` of ``out``, also if an error or an interrupt ends the run. A later run reuses them.
+    Returns the files written. Finished presses are kept in ``presses`` of ``out``, also if an error or an interrupt ends the run. A
+    later run reuses them.
 
     Raises:
         RaytacError: a press did not settle.
@@ -263,10 +262,8 @@ def draw_arrows(
 ) -> float:
     """Draw displacements as arrows from the markers at rest; returns their magnification.
 
-    Environment 0.
-
-    ``magnified``: factor on the arrows; None picks 1, 2, 5, 10 … so that the longest is about as long as the spacing of the markers.
-    ``image``: shown underneath, (H, W, 3) uint8.
+    Environment 0. ``magnified``: factor on the arrows; None picks 1, 2, 5, 10 … so that the longest is about as long as the spacing of
+    the markers. ``image``: shown underneath, (H, W, 3) uint8.
     """
     width, height = resolution
     rest, displacement = markers.rest_px[0], markers.displacement_px[0]

@@ -85,9 +85,8 @@ def machine() -> dict[str, Metric]:
 def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
     """Wilson's score interval of a proportion (J. Am. Stat. Assoc. 22, 1927).
 
-    Its ends are the p with (p̂ − p)² = z² p (1 − p) / n; z = 1.96 is 95 %.
-
-    Unlike p̂ ± z √(p̂ (1 − p̂) / n) it stays within 0 and 1 and has a width at p̂ = 0 and 1. Raises ``InputError`` without trials.
+    Its ends are the p with (p̂ − p)² = z² p (1 − p) / n; z = 1.96 is 95 %. Unlike p̂ ± z √(p̂ (1 − p̂) / n) it stays within 0 and 1 and
+    has a width at p̂ = 0 and 1. Raises ``InputError`` without trials.
     """
     if trials < 1 or not 0 <= successes <= trials:
         raise InputError(

@@ -22,7 +22,7 @@ from raytac.specs import PressScene, validate_press
 from raytac.specs.sensor import SensorSpec
 
 FILES = ("rgb.png", "frame.exr", "height.npy", "traction.npy", "markers.npz", "preview.png", "metrics.json")
-"""Every file that a press may write; those of an earlier press that a new one does not write are removed."""
+"""Every file of a press; those of an earlier press that a new one lacks are removed."""
 
 
 def run_press(

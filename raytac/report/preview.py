@@ -23,7 +23,7 @@ from raytac.report.style import STYLE
 from raytac.specs.sensor import CameraSpec, SensorSpec
 
 DIFFERENCE_RANGE = 64
-"""Grey levels (of 255) that the difference panel shows to full scale, in either direction; the same in every preview."""
+"""Levels (of 255) at full scale of the difference panel, either way, in every preview."""
 
 _STYLE = {
     **STYLE,
@@ -41,7 +41,7 @@ _PLATE = {"frameon": True, "facecolor": "white", "edgecolor": "none", "framealph
 """Ground of the section's legend, so that it reads over the dark object too."""
 _TICKS_MM = (-15, -10, -5, 0, 5, 10, 15)
 _UNTOUCHED = 1e-6
-"""Indentation [m] below which the pad counts as untouched when the section's plane is chosen."""
+"""Indentation [m] below which the pad is untouched when the section's plane is chosen."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,9 @@ class PreviewData:
     contact: np.ndarray
     """Contact mask, shape (Ny, Nx), bool."""
     extent_mm: tuple[float, float, float, float]
-    """Left, right, bottom and top edge of the image on the plane z = 0 [mm]; bottom > top because +y is image down."""
+    """Left, right, bottom, top edge of the image on z = 0 [mm]; bottom > top: +y is down."""
     object_height: np.ndarray | None = None
-    """z of the object's underside, pad frame [m], shape (Ny, Nx), not finite where there is no object."""
+    """z of the object's underside, pad frame [m], (Ny, Nx); not finite without an object."""
     rgb: np.ndarray | None = None
     """Tactile image, shape (H, W, 3), uint8."""
     rest_rgb: np.ndarray | None = None
@@ -71,7 +71,7 @@ class PreviewData:
     traction: np.ndarray | None = None
     """Force of the object on the pad per area, pad frame [Pa], shape (Ny, Nx, 3)."""
     traction_at_rest: bool = False
-    """True if ``traction`` is at the place of the coat at rest (the soft pad's), not where the contact is now."""
+    """True if ``traction`` is at the coat's place at rest (soft pad), not at the contact's."""
     section: tuple[float, float] | None = None
     """x, y [m] of the point that the cross-section goes through; None finds the deepest."""
 

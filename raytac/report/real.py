@@ -283,8 +283,7 @@ def table_text(metrics: Mapping[str, Metric], ablations: Sequence[str]) -> str:
 
 
 def draw(real: np.ndarray, images: list[dict[str, np.ndarray]], circles: list[np.ndarray], path: Path) -> None:
-    """Draw a row a press: the photograph, every mode that uses the one at rest, and its signed error (grey is none), cut to what is about
-    the contact."""
+    """Draw a row a press, cut to the contact: photograph, modes, signed errors (grey is none)."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 

@@ -11,10 +11,8 @@ _SPACING = 0.03e-3
 def coin_elevation(radius: float, height: float) -> np.ndarray:
     """Elevation [m] of the coin's face (N, N), from 0 (field) to ``height``.
 
-    Over the square of half edge ``radius`` [m].
-
-    Rows run along y, columns along x, seen through the coin from its back, so that the face-down coin reads the right way in the
-    camera's image (x right, y down). Flanks rise smoothly over 0.035 radius.
+    Over the square of half edge ``radius`` [m]. Rows run along y, columns along x, seen through the coin from its back, so that the
+    face-down coin reads the right way in the camera's image (x right, y down). Flanks rise smoothly over 0.035 radius.
     """
     n = min(max(2 * round(radius / _SPACING) + 1, 257), 1025)
     line = np.linspace(-1.0, 1.0, n)

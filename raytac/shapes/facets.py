@@ -7,13 +7,13 @@ import numpy as np
 from raytac.shapes.part import Part
 
 SAG = 2e-6
-"""Greatest distance of a facet inside a curved part [m]: far below the error of a pad's own triangles."""
+"""Greatest depth of a facet inside a curved part [m], far below the error of pad meshes."""
 _FEWEST, _MOST = 16, 256
 """Facets around a circle."""
 _RELIEF_SPACING = 0.2e-3
-"""Spacing of a relief's facets [m]: below the cells of the finest pad, since the map's own would be half a million."""
+"""Spacing of a relief's facets [m], below the finest cells; its map has half a million."""
 _RELIEF_SHARE = 0.04
-"""Greatest spacing as a share of a relief's half width: a small coin's rim is 0.15 radii wide."""
+"""Greatest spacing over a relief's half width: a small coin's rim is 0.15 radii wide."""
 
 
 def around(radius: float, sag: float) -> int:

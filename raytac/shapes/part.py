@@ -21,7 +21,7 @@ _SIZES = {
     "torus": 2,
 }
 _LONGEST = 1e3
-"""Greatest length and offset of a part [m]: beyond it, rounding hides anything of a pad's scale."""
+"""Greatest length and offset of a part [m]; beyond, rounding hides a pad's details."""
 _BLOCKS = 16
 """Blocks of triangles along the longest edge of a mesh."""
 PART_KINDS = (*_SIZES, "mesh", "relief")
@@ -46,16 +46,16 @@ class Part:
     vertices: np.ndarray | None = None
     faces: np.ndarray | None = None
     closed: bool = False
-    """Mesh only: watertight with outward faces, so that faces that look up cannot be the underside."""
+    """Mesh only: watertight with outward faces, so that faces that look up are no underside."""
     elevation: np.ndarray | None = None
     max_slope: float = 0.0
     """Relief only: greatest slope of the elevation."""
     joined: bool = False
-    """True if it is one solid with the object's first part and starts at that part's flat lower face, z = 0 in the object frame."""
+    """True if it is one solid with the first part, from that part's flat lower face (z = 0) on."""
 
     @cached_property
     def blocks(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centres and half edges (n, 3) [m] of boxes along the part's axes that together hold all triangles of a mesh or relief."""
+        """Centres and half edges (n, 3) [m] of boxes that hold all triangles of a mesh or relief."""
         assert self.vertices is not None and self.faces is not None
         corners = self.vertices[self.faces]
         low, high = corners.min(axis=1), corners.max(axis=1)

@@ -13,9 +13,8 @@ SOLIDS = ("plane", "box", "sphere", "cylinder", "capsule")
 def point_depth(part: Part, points: np.ndarray) -> np.ndarray:
     """Distance to the nearest face [m], (n,), positive inside.
 
-    Outside it is negative and no further than the true distance.
-
-    ``points``: (n, 3), in the frame of the part's body [m]. Raises ``ValueError`` for a kind that is not in ``SOLIDS``.
+    Outside it is negative and no further than the true distance. ``points``: (n, 3), in the frame of the part's body [m]. Raises
+    ``ValueError`` for a kind that is not in ``SOLIDS``.
     """
     pose, size = part.object_from_part, part.size
     at = (points - pose[:3, 3]) @ pose[:3, :3]

@@ -24,9 +24,7 @@ _ROOT_STEPS = 100
 def line_in_part(pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Vertical lines in the part frame: o as three (…, Ny, Nx), d as three (…, 1, 1).
 
-    Point o + t d; d is common to all lines.
-
-    ``pose``: (…, 4, 4).
+    Point o + t d; d is common to all lines. ``pose``: (…, 4, 4).
     """
     dx, dy = x - _entry(pose, 0, 3), y - _entry(pose, 1, 3)
     return [_entry(pose, 0, k) * dx + _entry(pose, 1, k) * dy for k in range(3)], [_entry(pose, 2, k) for k in range(3)]
@@ -237,7 +235,7 @@ def _quadric(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> Interval:
 
 
 def _slab(pose: np.ndarray, k: int, x: np.ndarray, y: np.ndarray, low: float, high: float) -> Interval:
-    """Interval of t with low <= o_k + t d_k <= high; o_k is a sum of a function of x and one of y, and so are its ends."""
+    """Interval of t with low <= o_k + t d_k <= high; o_k is a function of x plus one of y."""
     across, along = _entry(pose, 0, k) * (x - _entry(pose, 0, 3)), _entry(pose, 1, k) * (y - _entry(pose, 1, 3))
     d = _entry(pose, 2, k)
     flat = np.abs(d) < 1e-14

@@ -5,16 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 _BARELY_FLAT = 1e-12
-"""Projected area relative to the triangle's squared size below which it counts as vertical and its neighbours carry its edges."""
+"""Projected area over squared size below which a triangle counts as vertical."""
 
 
 def lowest_of_triangles(corners: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Lowest z [m] of triangles above each node, shape (Ny, Nx); ``inf`` where there is none.
 
-    ``corners`` [m], shape (T, 3, 3): triangle, corner, xyz in the pad frame. ``x`` (Nx,), ``y`` (Ny,): evenly spaced, ascending.
-
-    Each triangle is cut into grid rows, each row into the run of nodes between its left and right edge; z is the triangle's own
-    plane at the node (linear interpolation, exact), so the work is one step per covered row and one per covered node.
+    ``corners`` [m], shape (T, 3, 3): triangle, corner, xyz in the pad frame. ``x`` (Nx,), ``y`` (Ny,): evenly spaced, ascending. Each
+    triangle is cut into grid rows, each row into the run of nodes between its left and right edge; z is the triangle's own plane at the
+    node (linear interpolation, exact), so the work is one step per covered row and one per covered node.
     """
     ny, nx = len(y), len(x)
     lowest = np.full(ny * nx, np.inf)

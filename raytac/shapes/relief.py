@@ -34,7 +34,7 @@ def looks_down(part: Part, pose: np.ndarray) -> bool:
 
 
 def relief_underside(part: Part, pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """z [m] of the relief's underside, shape (Ny, Nx), ``inf`` off the pattern; arguments as in ``raytac.shapes.primitives``.
+    """z [m] of the relief's underside (Ny, Nx), ``inf`` off the pattern; see ``primitives``.
 
     On the line o + t d (part frame) the underside solves p_z + e(p_x, p_y) = 0. Face down the line is vertical in the part frame
     too and t is read off. Tilted by τ, t ← t − (p_z + e) / d_z is iterated; it converges while slope · tan τ < 1, which
@@ -56,7 +56,7 @@ def relief_underside(part: Part, pose: np.ndarray, x: np.ndarray, y: np.ndarray)
 
 
 def _facets(elevation: np.ndarray, half_width: float) -> tuple[np.ndarray, np.ndarray]:
-    """The raised pattern as triangles: vertices (N², 3) [m] and faces (F, 3) of the cells that rise above the plane."""
+    """The raised pattern as triangles: vertices (N², 3) [m], and faces (F, 3) above the plane."""
     n = len(elevation)
     line = np.linspace(-half_width, half_width, n)
     x, y = np.meshgrid(line, line)

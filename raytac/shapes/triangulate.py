@@ -93,7 +93,7 @@ def _ball(radii: np.ndarray, sag: float) -> ipc.TriMesh:
 def _turned(
     profile: Sequence[tuple[float, float]] | np.ndarray, sag: float, ends: tuple[float, float] | None = None
 ) -> ipc.TriMesh:
-    """A solid of revolution about z from its (radius, z) from low to high; ``ends`` are z of the poles, else the ends are flat."""
+    """Solid of revolution about z from (radius, z), upwards; ``ends``: z of poles, else flat."""
     rings = np.asarray(profile, float)
     count = around(float(rings[:, 0].max()), sag)
     angle = 2.0 * np.pi * np.arange(count) / count
@@ -113,7 +113,7 @@ def _turned(
 
 
 def _cone_profile(size: tuple[float, ...], sag: float) -> np.ndarray:
-    """(radius, z) of the rounded cone without its poles: the tip's ball up to where the flank touches it, then the rim."""
+    """(radius, z) of the rounded cone without its poles: the tip's ball, then the rim."""
     radius, height, tip = size
     if tip == 0.0:
         return np.array([[radius, height]])
@@ -202,13 +202,13 @@ def _disc_with_relief(disc: Part, relief: Part, sag: float) -> ipc.TriMesh:
 
 
 def _band(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
-    """Triangles (n, 3) each between two closed rings of as many vertices, ``low`` counter-clockwise seen from the side of ``high``."""
+    """Triangles (n, 3) between two closed rings; ``low`` counter-clockwise seen from ``high``."""
     low_next, high_next = np.roll(low, -1), np.roll(high, -1)
     return [np.stack([low, low_next, high_next], 1), np.stack([low, high_next, high], 1)]
 
 
 def _plate_with_pins(plate: Part, pins: Sequence[Part], sag: float) -> ipc.TriMesh:
-    """The plate's lower face as squares, each with a hole whose rim is a pin's; the other faces meet the squares' corners."""
+    """The plate's lower face: squares with a pin's rim as hole; other faces meet their corners."""
     (half_x, half_y, _), (radius, half_height) = plate.size, pins[0].size
     centres = np.array([pin.object_from_part[:2, 3] for pin in pins])
     columns, rows = (len(np.unique(np.round(centres[:, k], 12))) for k in (0, 1))

@@ -24,13 +24,11 @@ def object_height(
 ) -> np.ndarray:
     """Lowest z [m] of the object above each node, pad frame, (B, Ny, Nx), float64.
 
-    ``inf`` where nothing is above.
-
-    ``pad_from_object``: poses (B, 4, 4). ``x`` (Nx,), ``y`` (Ny,) [m]: evenly spaced, ascending; (B, Nx), (B, Ny) where every
-    environment has its own. The object is the union of its ``parts``: the minimum of their undersides (exact for primitives, exact linear
-    interpolation for meshes). ``below`` [m] saves work: what lies above it may be left out (its nodes read ``inf``). Nothing is cut off
-    at the pad: a part that reaches through it still shows its underside. A pose that is not finite gives NaN in its environment alone.
-    Raises ``InputError`` for poses of another shape.
+    ``inf`` where nothing is above. ``pad_from_object``: poses (B, 4, 4). ``x`` (Nx,), ``y`` (Ny,) [m]: evenly spaced, ascending; (B,
+    Nx), (B, Ny) where every environment has its own. The object is the union of its ``parts``: the minimum of their undersides (exact
+    for primitives, exact linear interpolation for meshes). ``below`` [m] saves work: what lies above it may be left out (its nodes read
+    ``inf``). Nothing is cut off at the pad: a part that reaches through it still shows its underside. A pose that is not finite gives
+    NaN in its environment alone. Raises ``InputError`` for poses of another shape.
     """
     poses = np.asarray(pad_from_object, float)
     if poses.ndim != 3 or poses.shape[1:] != (4, 4):
@@ -82,7 +80,7 @@ def _part_bounds(part: Part, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _may_show(part: Part, pose: np.ndarray, x: np.ndarray, y: np.ndarray, below: float) -> bool:
-    """False where no block of a mesh's or relief's triangles is over the nodes and reaches below ``below``, without placing a vertex."""
+    """False where no block of triangles is over the nodes and below ``below``; moves no vertex."""
     centre, half = part.blocks
     middle, reach = centre @ pose[:3, :3].T + pose[:3, 3], half @ np.abs(pose[:3, :3]).T + _SLACK
     near, far = middle - reach, middle + reach
@@ -120,7 +118,7 @@ def _lower_onto(lowest: np.ndarray, part: Part, poses: np.ndarray, x: np.ndarray
 
 
 def _box_below(part: Part, poses: np.ndarray, low: np.ndarray, high: np.ndarray, below: float) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest x, y (2,) [m] of what is lower than ``below`` of a primitive at poses (n, 4, 4) in boxes ``low`` to ``high``."""
+    """Least and greatest x, y (2,) [m] of what of a primitive at poses is below ``below``."""
     near, far = low[:, :2].min(axis=0), high[:, :2].max(axis=0)
     above = float(poses[:, 2, 3].min()) - below
     if above > 0.0:
@@ -132,7 +130,7 @@ def _box_below(part: Part, poses: np.ndarray, low: np.ndarray, high: np.ndarray,
 
 
 def _lower_surface_onto(lowest: np.ndarray, part: Part, pose: np.ndarray, x: np.ndarray, y: np.ndarray, below: float) -> None:
-    """As ``_lower_onto``, of a mesh or relief in one environment, within its bounding box; ``lowest`` (Ny, Nx)."""
+    """As ``_lower_onto``, of a mesh or relief in one environment, within its bounding box."""
     assert part.vertices is not None and part.faces is not None
     if not _may_show(part, pose, x, y, below):
         return

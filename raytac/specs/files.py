@@ -20,8 +20,7 @@ _FOLDERS: Final[dict[str, tuple[AssetKind, str]]] = {
 
 
 def available(what: str) -> tuple[str, ...]:
-    """Names of the shipped files of a kind: ``"sensor"``, ``"press scene"``, ``"task scene"``, ``"lights"``, ``"sweep"`` or ``"marker
-    motion"``."""
+    """Names of the shipped files of a kind, such as ``"sensor"`` or ``"press scene"``."""
     return tuple(sorted(path.stem for path in _folder(what).glob("*.toml")))
 
 
@@ -60,12 +59,12 @@ def find_file(what: str, name_or_path: str | Path, *, base: Path | None = None) 
 
 
 def name_of(path: Path) -> str:
-    """Stem of a file as text that can be written anywhere: bytes that are no UTF-8 as ``\\udcXX``."""
+    """Stem of a file as text that can be written anywhere; bytes not UTF-8 as ``\\udcXX``."""
     return path.stem.encode("utf-8", "backslashreplace").decode()
 
 
 def is_file(path: Path) -> bool:
-    """True if there is such a file; False for a path that no file can have, such as a name too long."""
+    """True if there is such a file; False too for a path that no file can have."""
     try:
         return path.is_file()
     except (OSError, ValueError):

@@ -18,7 +18,7 @@ class PunchSpec:
     """Motion of the skin around a contact that sticks: a rigid punch (docs/markers.md)."""
 
     anisotropy: float
-    """κ: how much farther the skin follows along the shear than across it [-]; ν / (2 − ν) on a half-space, 0 alike."""
+    """κ: excess of following along the shear over across it [-]; ν / (2 − ν) on a half-space."""
     reach: float
     """ℓ: length over which what a half-space would do fades in a pad of finite thickness [m]."""
     slip: float

@@ -11,9 +11,9 @@ _CHUNK = 1 << 18
 _MOST_PAIRS = 20_000
 """Crossing pairs after which the search ends: nobody repairs them one by one."""
 _MOST_TESTS = 200_000_000
-"""Pairs of triangles with overlapping boxes after which the search gives up: a sound mesh of a million triangles has a tenth."""
+"""Pairs with overlapping boxes that end the search; a sound million triangles have a tenth."""
 _ROUNDING = 16 * np.finfo(np.float64).eps
-"""Bound of the rounding error of a triple product of differences, as a share of the product of their lengths."""
+"""Bound of a triple product's rounding error, over the product of the lengths."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def _morton_order(corners: np.ndarray) -> np.ndarray:
 
 
 def _boxes(corners: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Boxes (low, high) of a complete binary tree over triangles in order, from the root down; a missing one is empty."""
+    """Boxes (low, high) of a binary tree over ordered triangles, root first; a missing is empty."""
     depth = int(np.ceil(np.log2(max(len(corners), 1))))
     low, high = np.full((2**depth, 3), np.inf), np.full((2**depth, 3), -np.inf)
     low[: len(corners)], high[: len(corners)] = corners.min(axis=1), corners.max(axis=1)
@@ -140,14 +140,14 @@ def _meet(corners: np.ndarray, faces: np.ndarray, pairs: np.ndarray) -> np.ndarr
 
 
 def _sides(corners: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Sign, (n, 3), of the side of the second triangle's plane on which the first one's corners lie; 0 to rounding."""
+    """Side (n, 3), as a sign, of the second triangle's plane of the first's corners; 0: on it."""
     s, t = corners[pairs[:, 0]], corners[pairs[:, 1]]
     u, v = t[:, 1] - t[:, 0], t[:, 2] - t[:, 0]
     return _sign(s - t[:, None, 0], u[:, None], v[:, None])
 
 
 def _edges_cross(corners: np.ndarray, faces: np.ndarray, pairs: np.ndarray, side: np.ndarray) -> np.ndarray:
-    """True where an edge of a pair's first triangle passes through the second, with which it shares no vertex."""
+    """True where an edge of the first triangle passes through the second; no shared vertex."""
     s, t = corners[pairs[:, 0]], corners[pairs[:, 1]]
     shared = (faces[pairs[:, 0]][:, :, None] == faces[pairs[:, 1]][:, None]).any(axis=2)
     result = np.zeros(len(pairs), bool)
@@ -174,7 +174,7 @@ def _sign(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 
 def _overlap(corners: np.ndarray) -> np.ndarray:
-    """True where pairs (n, 2, 3, 3) of triangles in one plane share more than a line: no edge's normal separates them."""
+    """True where coplanar pairs (n, 2, 3, 3) overlap: no edge's normal separates them."""
     normal = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
     drop = np.abs(normal).sum(axis=1).argmax(axis=1)
     kept = np.array([[1, 2], [0, 2], [0, 1]])[drop]

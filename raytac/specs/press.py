@@ -62,11 +62,11 @@ class ObjectSpec:
     kind: str
     """One of ``OBJECT_KINDS``."""
     params: dict[str, float | int | str]
-    """Lengths [m] and counts of the kind, by the key of its TOML file without the unit; for ``mesh`` the absolute ``path`` and
-    ``scale`` [m per file unit], for ``mjcf`` the absolute ``path`` and the name of the ``body``. Object frame of each kind:
-    ``scenes/README.md``."""
+    """Lengths [m] and counts, by the key of the TOML file without its unit.
+    For ``mesh`` the absolute ``path`` and ``scale`` [m per file unit], for ``mjcf`` the absolute ``path`` and the name of the ``body``.
+    Object frame of each kind: ``scenes/README.md``."""
     position: Vec3
-    """Offset of the object's origin from first touch above the pad centre, pad frame [m]; z is not used (contact sets it)."""
+    """Offset of the origin from first touch above the pad's centre, pad frame [m]; z is unused."""
     quaternion: tuple[float, float, float, float]
     """``pad_from_object`` rotation, wxyz, normalised."""
     mass: float
@@ -78,7 +78,7 @@ class ObjectSpec:
     poisson_ratio: float = 0.4
     """Of a soft object."""
     heights: tuple[tuple[float, ...], ...] = field(default=(), repr=False)
-    """Of the kind ``heights``: elevation [m] of the face that looks at the gel, rows along y, columns along x; 0 where there is none."""
+    """Elevation [m] of a ``heights`` object: rows along y, columns along x; 0 is no object."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.kind, str) or self.kind not in OBJECT_KINDS:

@@ -117,11 +117,11 @@ class GelpadSpec:
     bonded: str = "back"
     """Faces that are bonded to the case, one of ``BONDED``; used by the soft pad alone."""
     hysteresis: float = 0.1
-    """α, share of the energy that the gel loses in a cycle of rolling; used by the rigid pad in worlds alone. 0.1 is a guess: silicone
-    elastomers lose some per cent to some tens of per cent."""
+    """α, share of energy that the gel loses in a cycle of rolling; for rigid pads in worlds.
+    0.1 is a guess: silicone elastomers lose some per cent to some tens of per cent."""
     relaxation_time: float = 0.002
-    """τ [s] of the gel's internal damping along a contact's normal (Kelvin and Voigt): it carries E (ε + τ dε/dt); used by the rigid pad in
-    worlds alone. Not measured: with 2 ms the loss tangent is 0.13 at 10 Hz."""
+    """τ [s] of damping along a contact's normal, E (ε + τ dε/dt); for rigid pads in worlds.
+    Kelvin and Voigt's model. Not measured: with 2 ms the loss tangent is 0.13 at 10 Hz."""
 
     def __post_init__(self) -> None:
         check_fields(vars(self), SENSOR_SCHEMA["gelpad"], "gelpad")
@@ -197,8 +197,8 @@ class ResponseSpec:
     """
 
     exposure: float | Literal["auto"]
-    """Common gain from radiance [W/(m² sr), relative] to full scale 1; ``AUTO`` is the one that makes the image at rest mid-grey
-    (``raytac.optics.response``), which whoever renders finds."""
+    """Gain from radiance [W/(m² sr), relative] to full scale 1; ``AUTO``: rest is mid-grey.
+    Whoever renders finds that one (``raytac.optics.response``)."""
     white_balance: Vec3
     """Gain of each channel after the exposure."""
     gamma: float
@@ -206,11 +206,11 @@ class ResponseSpec:
     black_level: Vec3
     """Offset per channel in linear full scale."""
     vignetting: Vec3
-    """Coefficients (a1, a2, a3) of 1 + a1 r² + a2 r⁴ + a3 r⁶ with r = distance from the principal point over half the
-    image diagonal; all 0 is none (cos⁴ fall-off of the pinhole is not added)."""
+    """Coefficients (a1, a2, a3) of 1 + a1 r² + a2 r⁴ + a3 r⁶; all 0 is none.
+    r: distance from the principal point over half the image's diagonal. The pinhole's cos⁴ fall-off is not added."""
     shading_red: tuple[float, ...] = ()
-    """Colour shading, a smooth gain of the red channel over the image: coefficients c_ij of exp Σ c_ij T_i(x) T_j(y), i + j ≤ n, with
-    Chebyshev's polynomials T and x, y from −1 to 1 over the image's width and height, in the order c_00, c_01 … c_0n, c_10 …:
+    """Colour shading, a smooth gain of red over the image: exp Σ c_ij T_i(x) T_j(y), i + j ≤ n.
+    T: Chebyshev's polynomials; x, y: −1 to 1 over the image's width and height; in the order c_00, c_01 … c_0n, c_10 …:
     (n + 1)(n + 2)/2 of them for the degree n, or none for a gain of 1."""
     shading_green: tuple[float, ...] = ()
     shading_blue: tuple[float, ...] = ()
@@ -273,9 +273,8 @@ class MarkerSpec:
 class RefractionSpec:
     """Planar layers between the coat and the air around camera and LEDs.
 
-    ``model`` is ``"none"`` or ``"slab"``.
-
-    ``"slab"``: the gel and its support plate, index-matched, with a flat air interface at z = −(thickness + plate).
+    ``model`` is ``"none"`` or ``"slab"``. ``"slab"``: the gel and its support plate, index-matched, with a flat air interface at z =
+    −(thickness + plate).
     """
 
     model: str
@@ -315,9 +314,9 @@ class LedSpec:
     lobe: float
     """Lobe exponent n >= 1; 1 is a Lambertian emitter."""
     power: Vec3
-    """Intensity on the axis per camera channel (linear R, G, B) [W/sr, relative]: point-light equivalent at n and size."""
+    """On-axis intensity by channel (linear RGB) [W/sr, relative], as of a point light."""
     glow: float = 0.0
-    """Even radiance of the case's walls and floor over ``power`` [1/m²]: light of this LED that gel and housing scattered many times."""
+    """Even radiance of walls and floor over ``power`` [1/m²]: light scattered many times."""
 
     def __post_init__(self) -> None:
         check_fields(vars(self), LED_SCHEMA, "led")

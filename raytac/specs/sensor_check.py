@@ -96,7 +96,7 @@ def _check_camera(sensor: SensorSpec) -> None:
 
 
 def _check_view(sensor: SensorSpec) -> None:
-    """The outermost pixels see the pad: x = position_x + (u − cx) · pitch at z = 0 for u = 0 and u = W; y likewise."""
+    """The outermost pixels see the pad: x = position_x + (u − cx) · pitch at z = 0, y alike."""
     pad, camera = sensor.gelpad, sensor.camera
     for axis, name in enumerate("xy"):
         at, principal = camera.position[axis], camera.principal_point[axis]
@@ -198,7 +198,7 @@ def led_corners(led: LedSpec) -> tuple[Vec3, Vec3, Vec3, Vec3]:
 
 
 def _back_face(sensor: SensorSpec) -> float:
-    """Distance of the face towards the camera from z = 0 [m]: of the gel, or of its support plate where that refracts."""
+    """Distance of the face towards the camera from z = 0 [m]: gel, or a refracting plate."""
     slab = sensor.refraction.plate_thickness if sensor.refraction.model == "slab" else 0.0
     return sensor.gelpad.thickness + slab
 

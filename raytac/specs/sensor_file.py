@@ -60,8 +60,10 @@ def sensor_spec(sensor: str | Path | SensorSpec) -> SensorSpec:
 
 
 def _read_sensor(path: Path, above: tuple[Path, ...] = ()) -> SensorSpec:
-    """A sensor file; with ``base``, that sensor with every table and file that this one gives in place of its own. ``above``: files that
-    are built on this one."""
+    """A sensor file, or ``base`` with the tables and files of this one in place of its own.
+
+    ``above``: files that are built on this one.
+    """
     top = read_toml(path)
     parts = {name: schema for name, schema in SENSOR_SCHEMA.items() if name}
     base = None
@@ -189,10 +191,9 @@ _MOTION = "marker_motion.toml"
 def sensor_files(sensor: SensorSpec) -> dict[str, str]:
     """Texts by name of file: ``sensor.toml``, and further files that it needs.
 
-    Its lights are in a ``lights.toml`` beside it, which is not among them.
-
-    A sensor whose lights, response and optics are all that it does not have from a shipped one names that as its base; any other holds
-    every table itself. Markers' motion is a shipped name or a file beside it. No path of this machine is in it.
+    Its lights are in a ``lights.toml`` beside it, which is not among them. A sensor whose lights, response and optics are all that it
+    does not have from a shipped one names that as its base; any other holds every table itself. Markers' motion is a shipped name or a
+    file beside it. No path of this machine is in it.
     """
     files: dict[str, str] = {}
     base = _shipped_base(sensor)
@@ -208,7 +209,7 @@ def sensor_files(sensor: SensorSpec) -> dict[str, str]:
 
 
 def _shipped_base(sensor: SensorSpec) -> str | None:
-    """Name of the shipped sensor that ``sensor`` was read from and is but for its lights, response and optics; None if there is none."""
+    """Name of the shipped sensor that ``sensor`` is but for lights, response, optics; or None."""
     source = sensor.source
     if source is None or source.stem not in available("sensor") or source.resolve() != find_file("sensor", source.stem).resolve():
         return None
@@ -226,7 +227,7 @@ def _shipped_motion(motion: MarkerMotionSpec) -> str | None:
 
 
 def _table(sensor: SensorSpec, name: str) -> str:
-    """One table in the units of its keys, to fifteen digits: what is read back is the same number."""
+    """One table in the units of its keys, to fifteen digits, so that numbers come back equal."""
     lines = [f"[{name}]"]
     for key in SENSOR_SCHEMA[name]:
         own, unit = split_unit(key)

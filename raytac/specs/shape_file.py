@@ -42,7 +42,7 @@ OBJECT_SCHEMA: Final[dict[str, Schema]] = {
 
 
 def check_shape(table: Table, kind: str, values: dict[str, Any]) -> None:
-    """Rules between the values of one shape, as read by ``OBJECT_SCHEMA``; paths in ``values`` become absolute.
+    """Check rules between the values of one shape (``OBJECT_SCHEMA``); make paths absolute.
 
     Raises:
         SpecError: lengths that contradict each other, or a file that does not exist.
@@ -86,7 +86,7 @@ def check_quaternion(quaternion: object, key: str) -> None:
 
 
 def unit_quaternion(table: Table, quaternion: tuple[float, ...]) -> tuple[float, float, float, float]:
-    """w, x, y, z of unit length. Raises ``SpecError`` where ``quaternion_wxyz`` of the table is more than 1 % off it."""
+    """w, x, y, z of unit length. Raises ``SpecError`` for ``quaternion_wxyz`` more than 1 % off."""
     length = math.hypot(*quaternion)
     if abs(length - 1) > 0.01:
         rule = f"must be a unit quaternion w, x, y, z (to 1 %, then normalised); its length is {length:.4g}"

@@ -157,7 +157,7 @@ class SweepSpec:
             raise SpecError(rule, file=self.source, key=key, value=names)
 
     def _check_widths(self, prefix: str, widths: object, known: Mapping[str, tuple[str, Number]]) -> None:
-        """Refuse a name that no field has, or a value that no file could give; ``known``: field to its key and rule in a file."""
+        """Refuse an unknown name, or a value that no file could give; ``known``: (key, rule)."""
         if not isinstance(widths, Mapping):
             raise SpecError("must be a mapping of names to numbers", file=self.source, key=prefix, value=widths)
         for name, value in widths.items():

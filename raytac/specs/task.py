@@ -24,7 +24,7 @@ MOTIONS = ("fixed", "free", "soft")
 COUPLINGS = ("two_way", "one_way")
 """Couplings: forces on the pads act back on the robot and on MuJoCo's bodies, or do not."""
 PAIR_FRICTION = 0.5
-"""Friction coefficient of a body that names none, against all but gel (a guess: dry plastics lie between 0.2 and 0.6)."""
+"""Default friction of a body but on gel (a guess: dry plastics lie between 0.2 and 0.6)."""
 
 Quaternion = tuple[float, float, float, float]
 

@@ -44,8 +44,8 @@ _UNITS: Final[dict[str, tuple[float, float, str]]] = {
     "n": (1.0, 1.0, "N"),
     "s": (1.0, 1.0, "s"),
 }
-"""Suffix: (numerator and denominator of the factor to SI, how the unit is written). Longer suffixes stand first. Dividing by 1000
-rounds once, where multiplying by 0.001, itself rounded, makes 36 mm 0.036000000000000004 m."""
+"""Suffix: (numerator, denominator of the factor to SI, text). Longer suffixes stand first.
+Dividing by 1000 rounds once; multiplying by 0.001, itself rounded, makes 36 mm 0.036000000000000004 m."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Unit:
         return value * self.numerator / self.denominator
 
     def shown(self, value: Any) -> Any:
-        """A value in SI as a file would write it: a number or some, in this unit to six digits; anything else as it is."""
+        """A number or some in SI as a file writes them, to six digits; anything else as it is."""
         if isinstance(value, (tuple, list)):
             return [self.shown(item) for item in value]
         if not is_number(value) or self == Unit():
@@ -76,7 +76,7 @@ in_mm = Unit(*_UNITS["mm"]).shown
 
 
 def split_unit(key: str) -> tuple[str, Unit]:
-    """``"thickness_mm"`` to ``("thickness", millimetres)``; a key without a unit suffix is its own name and keeps its value."""
+    """``"thickness_mm"`` to ``("thickness", millimetres)``; a key without unit stays as it is."""
     for suffix, parts in _UNITS.items():
         if key.endswith("_" + suffix):
             return key[: -len(suffix) - 1], Unit(*parts)
@@ -195,9 +195,7 @@ class Integer(Number):
 class Text(_Field):
     """A non-empty string: one of ``choices``, or one that ``pattern`` matches as a whole.
 
-    ``described`` says the pattern in words.
-
-    With ``length`` = ``ANY``, a list of one or more of them, none twice.
+    ``described`` says the pattern in words. With ``length`` = ``ANY``, a list of one or more of them, none twice.
     """
 
     choices: tuple[str, ...] = ()
@@ -241,7 +239,7 @@ class Flag(_Field):
 
 
 def _in_si(interval: Interval, unit: Unit) -> Interval:
-    """The same range in SI. Conversion is monotone, so that what lies in the range of the file lies in this one."""
+    """The same range in SI. Conversion is monotone: what is in one range is in the other."""
     return Interval(unit.to_si(interval.low), unit.to_si(interval.high), interval.low_open, interval.high_open)
 
 
@@ -249,11 +247,10 @@ Schema = Mapping[str, Number | Text | Flag]
 
 
 def check_fields(values: Mapping[str, Any], schema: Schema, prefix: str = "", file: Path | None = None) -> None:
-    """Check values in SI, by name, against the schema of the table that describes them in a file.
+    """Check values in SI, by name, against the schema of their table in a file.
 
-    ``vars`` gives those of a dataclass.
-
-    Thus a specification that was made or changed in code obeys the rules of one from a file. The default of a field needs no check.
+    ``vars`` gives those of a dataclass. Thus a specification that was made or changed in code obeys the rules of one from a file. The
+    default of a field needs no check.
 
     Raises:
         SpecError: a value of the wrong type or out of its range; the message gives the key and the value as a file would write them.
@@ -296,7 +293,7 @@ class Table:
             raise self.error(refused.rule, key, self.data[key], refused.choices) from None
 
     def read(self, schema: Schema, *, sections: Sequence[str] = ()) -> dict[str, Any]:
-        """Every field of ``schema``, in SI, under its name without unit; ``sections`` are sub-tables read elsewhere.
+        """Fields of ``schema`` in SI, by name without unit; ``sections``: sub-tables read elsewhere.
 
         Raises:
             SpecError: an unknown key (checked first, so that a misspelt key is called that and not missing), a missing key, a
@@ -318,7 +315,7 @@ class Table:
         return Table(value, self.file, self._dotted(name))
 
     def sections(self, name: str) -> tuple[Table, ...]:
-        """The array of tables ``[[name]]``, empty if absent; errors name them ``name[0]``, ``name[1]``…"""
+        """The array of tables ``[[name]]``, empty if absent; errors say ``name[0]``, ``name[1]``…"""
         value = self.data.get(name, [])
         if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
             raise self.error(f"must be an array of tables [[{name}]]", name, value)

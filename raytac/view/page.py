@@ -46,7 +46,7 @@ class Page:
         """One thread draws at a time: the player's, or that of a user who changed what is shown."""
         self._last: Snapshot | None = None
         self._moved: set[str] = set()
-        """Controls that users moved since the last play, step or reset: they stay where the users put them."""
+        """Controls moved since the last play, step or reset: they stay where users put them."""
         names = [name for name in QUANTITIES if any(name in pad.quantities for pad in session.pads)]
         self._scales = {name: ColourScale(QUANTITIES[name]) for name in names}
         self._labels = {QUANTITIES[name].label: name for name in names}
@@ -219,16 +219,16 @@ def _boxed(text: str, colour: str) -> str:
 
 
 ARROW_SCALE = 2.0
-"""Length of a drawn arrow over the marker's displacement, so that tenths of a pixel are seen."""
+"""Length of a drawn arrow over the displacement, so that tenths of a pixel are seen."""
 _LEAST_WIDTH = 480
-"""Images are enlarged by a whole factor to at least this width [px], so that arrows are crisp."""
+"""Least width [px] to which images are enlarged, by a whole factor, for crisp arrows."""
 _SHORTEST = 1.0
 """Arrows of fewer enlarged pixels are drawn as dots."""
 _INK = (255, 220, 60)
 
 
 def picture(pad: PadView, *, arrows: bool) -> np.ndarray | None:
-    """8-bit image (H', W', 3) of the pad's sensor; None if it makes none. ``arrows``: where it has markers, over the image."""
+    """8-bit image (H', W', 3) of a pad's sensor, or None; ``arrows``: of markers, over it."""
     if pad.rgb is None:
         return None
     factor = -(-_LEAST_WIDTH // pad.rgb.shape[1])

@@ -22,7 +22,7 @@ class Status:
     """State of the player."""
 
     mode: str = "starting"
-    """``starting``, ``paused``, ``playing``, ``driving`` (moving to the targets of the controls) or ``stopped``."""
+    """``starting``, ``paused``, ``playing``, ``driving`` (to controls' targets) or ``stopped``."""
     states_per_s: float = 0.0
     """States computed, imaged and handed out a second, smoothed; 0 when nothing moves."""
     count: int = 0
@@ -47,7 +47,7 @@ class Player:
     """
 
     def __init__(self, session: Session, show: Callable[[Snapshot | None, Status], None]) -> None:
-        """``show(snapshot, status)`` is called by the player's thread; the snapshot is None where only the status changed."""
+        """``show(snapshot, status)`` is called in the player's thread; None: only status changed."""
         self._session, self._show = session, show
         self._names = tuple(control.name for control in session.controls)
         self._wakeup = threading.Condition()

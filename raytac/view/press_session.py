@@ -37,9 +37,9 @@ _NEAR = {"depth": 0.004, "force": 0.02, "shear_x": 0.004, "shear_y": 0.004, "twi
 _DEEPEST = 0.4
 """Share of the pad's thickness that the depth slider reaches, more if the scene goes deeper."""
 _STRONGEST, _FARTHEST, _WIDEST = 20.0, 2.0, 30.0
-"""Ends of the sliders for force [N], shear [mm] and twist [degrees], until the object goes beyond them."""
+"""Ends of the sliders for force [N], shear [mm] and twist [degrees], until exceeded."""
 _STATES, _SIMULATED_STATES = 20, 10
-"""States a stage of the scene's own trajectory is shown in; of a soft pad each costs at least one step of the solver."""
+"""States that show a stage of a trajectory; a soft pad's cost a solver step each, at least."""
 _SAG = 1e-5
 """Largest depth of the drawn facets below a curved object's true surface [m]."""
 _OBJECT_COLOUR = (150, 156, 166)
@@ -144,7 +144,7 @@ class PressSession:
         )
 
     def _stage_to(self, name: str) -> tuple[StageSpec | None, int]:
-        """The stage that takes the object to where the control ``name`` is held, in how many states; None if it is there."""
+        """Stage and number of states to the target of the control ``name``; None if it is there."""
         now, wanted = self._places(), self._targets[name]
         off = wanted - now[name]
         if abs(off) <= _NEAR[name]:
@@ -195,7 +195,7 @@ class PressSession:
         return tuple(shapes)
 
     def _soft_object(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Surface of an object that deforms as it is now: vertices in the pad frame (V, 3) [m] and faces; None for a rigid one."""
+        """Vertices (V, 3) [m], pad frame, and faces of a deforming object now; None if rigid."""
         solver = self._pad.solver if isinstance(self._pad, SoftPad) else None
         if solver is None or not solver.body.is_soft:
             return None

@@ -18,9 +18,9 @@ _FIELD_OF_VIEW = np.radians(38.0)
 """From top to bottom of the 3-D view [rad]: narrow, so that near edges are not blown up."""
 
 _AMBIENT = 0.5
-"""Light from everywhere beside viser's own from above, so that the colours of a coat that looks down are seen."""
+"""Ambient light beside viser's own from above, for the colours of a coat that looks down."""
 _NEAR_A_PAD = (0.035, 0.06, 0.06)
-"""Place of an eye that looks at a pad, pad frame [m]: oblique, beyond the fingertips of a gripper."""
+"""Place of an eye that looks at a pad, pad frame [m]: oblique, beyond a gripper's fingers."""
 _THIN = 0.35
 """Opacity of what pads are seen through."""
 
@@ -29,7 +29,7 @@ class SceneView:
     """Draws solids, lines and coats; one caller at a time."""
 
     def __init__(self, server: ViserServer, session: Session) -> None:
-        """Put the session's solids and lines into the scene, unplaced, and the eye where the session wants it."""
+        """Put solids and lines into the scene, unplaced, and the eye where the session wants it."""
         self._session = session
         self._server, self._pads = server, {pad.name: pad for pad in session.pads}
         self._scale = session.units_per_metre
@@ -60,7 +60,7 @@ class SceneView:
         self._coats = {}
 
     def look(self, client: ClientHandle, view: PadView | None) -> None:
-        """Take one client's eye to a pad, on the side that the pad looks to; None is back to the start."""
+        """Take a client's eye to a pad, on the side that it looks to; None is back to the start."""
         if view is None:
             eye, target = (np.asarray(place) for place in (self._session.camera.position, self._session.camera.look_at))
         else:
@@ -80,7 +80,7 @@ class SceneView:
             self._solids[name].opacity = min(opacity, _THIN) if wanted else _opacity(opacity)
 
     def draw(self, snapshot: Snapshot, scales: dict[str, ColourScale], quantity: str) -> None:
-        """Place and colour everything; ``scales`` by quantity, ``quantity`` is the one that colours the coats."""
+        """Place and colour everything; ``quantity`` is that of ``scales`` which colours the coats."""
         with self._server.atomic():
             for name, pose in snapshot.poses.items():
                 handle = self._solids.get(name) or self._lines.get(name)
@@ -121,7 +121,7 @@ _MATERIAL = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals (V, 3), float32: of the faces around each vertex, weighted by area; +z for a vertex without area."""
+    """Unit normals (V, 3), float32: area-weighted means of faces; +z for a vertex without area."""
     corner = vertices[faces]
     across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     corners = faces.ravel()

@@ -40,12 +40,12 @@ def coat_pad(name: str, sensor: TactileSensor, grid: PadGrid) -> Pad:
 
 
 def coat_lines(name: str) -> Lines:
-    """Edges of a soft pad's own mesh over its smooth coat; the first frame's ``coat_edges`` say where and how many."""
+    """Edges of a soft pad's mesh over its smooth coat, placed by the frames' ``coat_edges``."""
     return Lines(name, np.zeros((1, 2, 3)), _MESH, 0.8)
 
 
 def square(size: float) -> tuple[np.ndarray, np.ndarray]:
-    """A square of ``size`` [m] of the plane z = 0 about the origin: vertices and faces, seen from both sides."""
+    """Vertices and faces of a square of ``size`` [m] about the origin in z = 0, two-sided."""
     corners = 0.5 * size * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     return corners, np.array([[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 3, 2]])
 
@@ -59,7 +59,7 @@ def grid_faces(grid: PadGrid) -> np.ndarray:
 
 
 def pad_view(frame: TactileFrame, grid: PadGrid, world_from_pad: np.ndarray, env: int = 0) -> PadView:
-    """View of one environment's frame, with the coat at the nodes of ``grid`` (from ``strided``)."""
+    """View of one environment's frame, its coat at the nodes of ``grid`` (from ``strided``)."""
     at, height = _places(frame.surface.grid, grid), _thinned_height(frame.surface, grid, env)
     x, y = np.meshgrid(grid.x, grid.y)
     values = {"indentation": (grid.rest - height).ravel()}
@@ -115,7 +115,7 @@ def coat_edges(surface: GelSurface, grid: PadGrid, env: int = 0) -> np.ndarray:
 
 
 def _on_faces(grid: PadGrid, height: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Height of the triangles of ``grid_faces`` at places (..., 2); beyond the grid that of its edge."""
+    """Height of the triangles of ``grid_faces`` at places (..., 2); beyond the grid its edge's."""
     where = [np.clip(points[..., k], axis[0], axis[-1]) for k, axis in enumerate((grid.x, grid.y))]
     i, j = (
         np.clip(np.searchsorted(axis, at, "right") - 1, 0, len(axis) - 2)
@@ -138,7 +138,7 @@ def _places(full: PadGrid, grid: PadGrid) -> tuple[np.ndarray, ...]:
 
 
 def gel_solid(spec: SensorSpec, name: str = "gel") -> Solid:
-    """The gel block below its coat, see-through, down from the resting edge of the coat; pad frame."""
+    """The gel block down from the coat's resting edge, see-through; pad frame."""
     gel = spec.gelpad
     x, y = (np.linspace(-0.5 * size, 0.5 * size, 25) for size in gel.size)
     around = np.concatenate(
@@ -159,7 +159,7 @@ def gel_solid(spec: SensorSpec, name: str = "gel") -> Solid:
 
 
 def sensor_solids(spec: SensorSpec) -> tuple[Solid, ...]:
-    """The gel block, and every light as its rectangle, seen from both sides, in the colour of its light; pad frame."""
+    """The gel block, and every light as a two-sided rectangle in its colour; pad frame."""
     return (gel_solid(spec), *_lights(spec))
 
 

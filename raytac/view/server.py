@@ -222,7 +222,7 @@ def checked_message(raw: bytes | str, element: Callable[[str], Any]) -> bytes:
 
 
 def one_line(text: str) -> str:
-    """The start of a text that may quote anything, without line breaks and whatever else commands a terminal."""
+    """Start of a text that may quote anything, without what commands a terminal."""
     return "".join(c if c.isprintable() else "?" for c in text[:120])
 
 

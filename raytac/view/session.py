@@ -70,7 +70,7 @@ def check_targets(controls: Sequence[Control], targets: Mapping[str, float]) -> 
 
 
 def reaching(controls: Sequence[Control], places: Mapping[str, float]) -> tuple[Control, ...]:
-    """The controls with ends moved out to a round number wherever something is beyond them, so that a slider can show it."""
+    """The controls, with ends moved out to a round number where ``places`` are beyond them."""
     moved = []
     for control in controls:
         place = places.get(control.name, control.low)

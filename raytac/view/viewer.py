@@ -82,7 +82,7 @@ class Viewer:
 
 
 def check_address(host: str, port: int, allow_hosts: Sequence[str] = ()) -> None:
-    """Raises ``InputError`` for a host and port that cannot be listened at, and for allowed names that are none."""
+    """Raise ``InputError`` for a host and port that cannot be used, and names that are none."""
     PageAddresses(host, allow_hosts)
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= 65535:
         raise InputError("port", value=port, rule="must be a whole number in [0, 65535]; 0 takes any that is free")

@@ -195,7 +195,7 @@ class Steering:
         self._world, self._dt = world, world.composed.control_timestep
         self._model, arm = world.model, world.arm
         self.missing = ""
-        """Why the robot's pose cannot be steered, for people; empty if it can, or if there is nothing to steer."""
+        """Why the robot's pose cannot be steered, for people; empty if nothing hinders it."""
         self._servos: dict[str, int] = {}
         self._ik, self._law = None, None
         if arm is not None and set(arm.joints) == set(_POSE):

@@ -1,4 +1,4 @@
-"""Optical modes that shade a height image: the camera's view of the coat as one height a pixel, and a colour from its slopes.
+"""Optical modes that shade a height image: one height a pixel, and colour by its slopes.
 
 The Taxim table and Phong's model know nothing of rays, so one front step serves both: each pixel's ray is intersected with the
 height field by two Newton steps, and slopes follow by central differences between neighbouring pixels, as published. Everything is
@@ -46,7 +46,7 @@ class ImageHeights:
     """Piece that is rendered, (left, top, width, height) [px]; None is all."""
 
     def pixel(self, mi: Any) -> tuple[Any, Any, Any, Any]:
-        """(index in these arrays, index in the whole image, column, row) of every pixel that is rendered."""
+        """(index here, index in the whole image, column, row) of every pixel that is rendered."""
         first_x, first_y, width, height = self.crop or (0, 0, *self.resolution)
         i = dr.arange(mi.UInt32, self.envs * width * height)
         p = i % (width * height)
@@ -65,7 +65,7 @@ class ImageHeights:
         return dr.gather(type(values), values, self.pixel(mi)[0])
 
     def slopes(self, mi: Any, of: Any) -> tuple[Any, Any, list[Any]]:
-        """(s_x, s_y, the four neighbours' values) by central differences of ``of``; the rim repeats the pixels next to it (upstream)."""
+        """(s_x, s_y, four neighbours) by central differences; rims repeat the next pixel (upstream)."""
         width, height = self.resolution
         left, top, wide, _ = grown(self.crop, self.resolution)
         i, _, column, row = self.pixel(mi)
@@ -76,7 +76,7 @@ class ImageHeights:
 
 
 def grown(crop: tuple[int, int, int, int] | None, resolution: tuple[int, int]) -> tuple[int, int, int, int]:
-    """A crop of an image with the pixels around it that its slopes need, three a side at least; None is the whole image."""
+    """A crop with the pixels around it that slopes need, at least three; None: the whole image."""
     columns, rows = resolution
     left, top, width, height = crop or (0, 0, columns, rows)
     x0, y0 = max(min(left - 1, columns - 3), 0), max(min(top - 1, rows - 3), 0)
@@ -136,7 +136,7 @@ def see_heights(
 
 
 class ImageMode(DeviceMode):
-    """Base of the modes that shade height images: they give ``_levels`` and ``_floats_per_pixel``. Nothing is random."""
+    """Base of the modes that shade height images, by ``_levels`` and ``_floats_per_pixel``."""
 
     _smallest_side = 3
     _longest_row = 4
@@ -147,7 +147,7 @@ class ImageMode(DeviceMode):
 
     @abstractmethod
     def _levels(self, seen: ImageHeights, arrays: Any) -> tuple[list[Float], UInt8]:
-        """Three channels of B·H·W levels, neither rounded nor clipped, and flags (B·H·W, or one unused value)."""
+        """Three channels of B·H·W levels, not clipped, and flags (B·H·W, or one unused value)."""
 
     @abstractmethod
     def _floats_per_pixel(self) -> float:
@@ -177,13 +177,13 @@ class ImageMode(DeviceMode):
         return seen
 
     def _seen_now(self, surface: GelSurface, *, dotted: bool) -> tuple[ImageHeights, FrameInputs, np.ndarray]:
-        """Surface seen by the pixels, without a recording; its inputs; and a mask of the failed environments."""
+        """Surface seen by the pixels, without a recording; its inputs; mask of failed environments."""
         heights, failed = self._checked(surface)
         inputs = replace(self._inputs, ink=self._upload_ink(surface) if dotted else None)
         return self._see(self._upload(heights), self._upload_contact(surface, failed), inputs), inputs, failed
 
     def render_levels(self, surface: GelSurface) -> np.ndarray:
-        """The image before rounding and clipping [levels, 0-255], shape (B, H, W, 3), float32; NaN where an environment failed."""
+        """The image before rounding [levels, 0-255], (B, H, W, 3) float32; NaN where it failed."""
         seen, inputs, failed = self._seen_now(surface, dotted=True)
         channels, _ = self._inked_levels(seen, inputs)
         image = np.stack([np.array(c) for c in channels], axis=-1).reshape(*self._shape(surface.batch), 3)
@@ -191,7 +191,7 @@ class ImageMode(DeviceMode):
         return image
 
     def image_heights(self, surface: GelSurface) -> tuple[np.ndarray, np.ndarray]:
-        """(−z, rest − z) of the coat through every pixel's centre [image pixels], each (B, H, W) float32."""
+        """(−z, rest − z) of the coat at every pixel's centre [image pixels], (B, H, W) float32."""
         seen, _, failed = self._seen_now(surface, dotted=False)
         own = (np.array(seen.here(self.mi, v)) for v in (seen.height, seen.displacement))
         heights, displacements = (v.reshape(self._shape(surface.batch)) for v in own)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PhongLight:
-    """One light: direction to it (x right, y down, z to the camera, not normalised), colour R, G, B [levels], k_d and k_s."""
+    """A light: direction to it (image axes, not normalised), colour [levels], k_d and k_s."""
 
     direction: Vec3
     colour: Vec3
@@ -46,7 +46,7 @@ PHONG_LIGHTS: dict[str, tuple[PhongLight, ...]] = {
         PhongLight((1.0, 0.0, 0.25), (150.0, 240.0, 100.0), 0.5, 0.15),
     ),
 }
-"""Published sets by name: two sensors of the paper, and the lights of the robot simulation in the same release."""
+"""Published sets by name: two sensors of the paper, and its robot simulation's."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,9 @@ class Phong(OpticsConfig[Any]):
     """Phong shading of the height image, the baseline of papers on tactile images."""
 
     lights: str | tuple[PhongLight, ...] = "gelsight2017"
-    """A name of ``PHONG_LIGHTS``, or lights. The default is the set with three colours, as a GelSight Mini has them."""
+    """A name of ``PHONG_LIGHTS``, or lights; by default three colours, as a GelSight Mini has."""
     background: np.ndarray | None = None
-    """Image at rest, (H, W, 3) uint8 at the mode's resolution; None is what the ray tracer makes of this sensor."""
+    """Image at rest, (H, W, 3) uint8, of the mode's resolution; None is the ray tracer's."""
 
     def __post_init__(self) -> None:
         if isinstance(self.lights, str) and self.lights not in PHONG_LIGHTS:
@@ -84,7 +84,7 @@ class Phong(OpticsConfig[Any]):
 
 @dataclass(frozen=True)
 class Mlp(OpticsConfig[Any]):
-    """A small network from slope and place to colour, fitted to presses of a real sensor; there is none by default."""
+    """A small network from slope and place to colour, fitted to a real sensor; no default."""
 
     weights: str | Path | MlpWeights | None = None
     """The network, its file, or the folder of ``raytac calibrate … --model mlp``."""

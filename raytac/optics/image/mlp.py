@@ -1,4 +1,4 @@
-"""The optical mode ``mlp``: colour by a small network from slope and place (``mlp_weights``), fitted to presses of a sensor."""
+"""The optical mode ``mlp``: colour by a small network (``mlp_weights``)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _VIEW_TOLERANCE = 0.01
 
 
 class MlpMode(ImageMode):
-    """The optical mode ``mlp``: one sensor, one network, one resolution; batches of surfaces in, images out."""
+    """The optical mode ``mlp`` of one sensor, network and resolution, for batches of surfaces."""
 
     needs_contact = True
 

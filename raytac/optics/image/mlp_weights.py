@@ -25,7 +25,7 @@ from raytac.optics.taxim.restricted_pickle import check_file_numbers, npz_arrays
 from raytac.specs.sensor import SensorSpec
 
 FORMAT, VERSION = "raytac mlp", 1
-"""Format and version in a file. The version goes up whenever inputs, arithmetic or arrays change their meaning."""
+"""Format and version of a file; the version counts changes of inputs, arithmetic or arrays."""
 INPUTS = 16
 LEVELS = 100.0
 """Levels that an output of 1 stands for."""
@@ -35,7 +35,7 @@ _LARGEST = 256
 
 @dataclass(frozen=True)
 class MlpWeights:
-    """Matrices (out, in) and offsets (out,) of every layer, and the image at rest [levels], (H, W, 3) float32."""
+    """Matrices (out, in), offsets (out,), and the image at rest [levels], (H, W, 3) float32."""
 
     matrices: tuple[np.ndarray, ...]
     offsets: tuple[np.ndarray, ...]
@@ -60,7 +60,7 @@ def view_slope(sensor: SensorSpec) -> tuple[float, float]:
 
 
 def inputs(ops: Any, slope_x: Any, slope_y: Any, touched: Any, u: Any, v: Any, view: tuple[float, float]) -> list[Any]:
-    """The network's ``INPUTS`` arrays of slopes of the displacement, c (0. or 1.) and places u, v; ``ops`` is NumPy or Dr.Jit."""
+    """The ``INPUTS`` arrays of slopes, c (0. or 1.) and places u, v; ``ops``: NumPy or Dr.Jit."""
     nz = 1 / ops.sqrt(slope_x * slope_x + slope_y * slope_y + 1)
     tx, ty = view[0] * u, view[1] * v
     wz = 1 / ops.sqrt(tx * tx + ty * ty + 1)
@@ -89,7 +89,7 @@ def save_mlp(weights: MlpWeights, path: Path) -> None:
 
 
 def load_mlp(path: str | Path) -> MlpWeights:
-    """A network that ``save_mlp`` wrote; ``path`` may be the folder of ``raytac calibrate``, with ``mlp.npz`` in it.
+    """A network that ``save_mlp`` wrote: its file, or the folder of ``raytac calibrate``.
 
     Raises CalibrationError for a file that is missing, damaged, of another version, or holds other arrays.
     """

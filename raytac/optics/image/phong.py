@@ -1,4 +1,4 @@
-"""Phong shading of the height image: the baseline that papers on tactile images compare with.
+"""Phong shading of the height image, a baseline of papers on tactile images.
 
 Gomes, Paoletti and Luo, Generation of GelSight tactile images for sim2real learning, RA-L 2021 (section III-C), as their released
 simulator computes it. On the image B at rest, dimmed to k_a B, black is laid where the gel is pressed, and then each light's colour:
@@ -30,11 +30,11 @@ THICKNESS = 4e-3
 """Depth at which the pressed gel is black [m]: their elastomer's thickness."""
 SPECULAR_EXPONENT = 5
 _BLUR = (0.2960964, 0.4078072)
-"""Outer and central tap of the last blur: a Gaussian of σ = 1 px on a row of three pixels, mirrored at its ends."""
+"""Outer and central tap of the last blur: σ = 1 px on three pixels, mirrored at the ends."""
 
 
 class PhongMode(ImageMode):
-    """The optical mode ``phong``: one sensor, one set of lights, one resolution; batches of surfaces in, images out."""
+    """The optical mode ``phong`` of one sensor, set of lights and resolution, for batches."""
 
     config: Phong
 
@@ -71,7 +71,7 @@ class PhongMode(ImageMode):
 
     @staticmethod
     def _overlay(below: Any, alpha: Any, colour: float) -> Any:
-        """``colour`` laid over with opacity ``alpha``, which may leave [0, 1]; cut to whole levels in [0, 255] (upstream)."""
+        """``colour`` laid over with opacity ``alpha`` of any value; whole levels in [0, 255]."""
         return dr.floor(dr.clip((1 - alpha) * below + alpha * colour, 0, 255))
 
     def _blurred(self, seen: ImageHeights, channels: list[Any]) -> list[Any]:

@@ -22,11 +22,11 @@ class RayTraced(OpticsConfig[Any]):
     """Ray tracing with Mitsuba 3 and Dr.Jit: the deterministic ``fast``, or path tracing."""
 
     integrator: Literal["fast", "reference", "path"] = "fast"
-    """``fast`` (deterministic), ``reference`` (unbiased path tracing of our own) or ``path`` (Mitsuba's, to compare)."""
+    """``fast`` (deterministic), ``reference`` (our path tracing) or ``path`` (Mitsuba's)."""
     spp: int | None = None
-    """Samples a pixel. ``fast``: camera rays on a regular grid, a square number, 1 if None. Else: random samples, 256 if None."""
+    """Samples a pixel. ``fast``: a square number of rays, 1 if None; else random, 256 if None."""
     shadows: bool | None = None
-    """Cast shadows in ``fast``; None is as the sensor says. The sampled integrators always cast them."""
+    """Cast shadows in ``fast``; None is as the sensor says. Sampled integrators always do."""
     layers: Literal["colour", "led"] = "colour"
     """One layer per ``colour`` group of the light file, or per ``led``."""
     bounce: bool = True
@@ -36,9 +36,9 @@ class RayTraced(OpticsConfig[Any]):
     max_depth: int = -1
     """Sampled integrators: number of reflections; 1 is direct light only, −1 has no limit."""
     flat_field: np.ndarray | None = None
-    """Real image of the untouched sensor, (H, W, 3) uint8: images are flat_field × rendered / rendered at rest, in linear light."""
+    """Real image at rest, (H, W, 3) uint8; images are it × rendered / rendered at rest, linear."""
     denoise: bool = False
-    """Filter the layers of the sampled integrators (OptiX on CUDA, Open Image Denoise on the CPU)."""
+    """Filter sampled layers (OptiX on CUDA, Open Image Denoise on the CPU)."""
     progress: bool = False
     """Show a progress bar for sampled images."""
     outputs: ClassVar[tuple[str, ...]] = OPTICAL_OUTPUTS

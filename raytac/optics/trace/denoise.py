@@ -1,4 +1,4 @@
-"""Denoise sampled images: OptiX's denoiser on CUDA, Open Image Denoise on the CPU. Both are biased; labels say when one ran."""
+"""Denoise sampled images: OptiX's denoiser on CUDA, Open Image Denoise on the CPU."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ assert abs(float(mi.Float(image.array)[0]) - 0.5) < 0.05, "a grey image does not
 
 
 def make_denoiser(mi: Any, device: str, resolution: tuple[int, int]) -> Callable[[np.ndarray], np.ndarray]:
-    """A function from a noisy linear image (H, W, 3) to a clean one, for images of ``resolution`` (width, height).
+    """A function from a noisy linear image (H, W, 3) to a clean one, for one ``resolution``.
 
     Raises BackendError: on the CPU without the package mitsuba-oidn; on CUDA where OptiX's denoiser does not work.
     """
@@ -45,7 +45,7 @@ def make_denoiser(mi: Any, device: str, resolution: tuple[int, int]) -> Callable
 
 @functools.cache
 def _optix_failure() -> str:
-    """Why OptiX's denoiser does not work here, or nothing; tried in a process of its own, because where it fails Dr.Jit aborts."""
+    """Why OptiX's denoiser fails here, or nothing; in its own process, since Dr.Jit aborts."""
     try:
         done = subprocess.run([sys.executable, "-c", _TRY_OPTIX], capture_output=True, text=True, timeout=120)
     except subprocess.TimeoutExpired:

@@ -1,4 +1,4 @@
-"""The ``fast`` integrator: direct light by quadrature over every LED, inter-reflection by a smooth field. No noise, no samples.
+"""The ``fast`` integrator: direct light by quadrature over every LED; nothing is random.
 
 For each pixel one camera ray meets the coat, and for each LED the rendering equation's direct term is summed over a small grid of
 points on its rectangle (Kajiya 1986, eq. 1 restricted to one bounce; area form of Shirley, Wang and Zimmerman 1996):
@@ -32,7 +32,7 @@ def direct_light(
     specular: bool = True,
     slab: Slab | None = None,
 ) -> tuple[Any, Any]:
-    """(diffuse, specular) transport of one LED to every pixel for unit power: multiply by power and reflectance to get radiance.
+    """(diffuse, specular) transport of one LED to every pixel, by power and reflectance.
 
     ``points`` × ``points`` quadrature nodes (midpoint rule) over the LED's rectangle, one shadow ray each; through the face of
     ``slab`` if there is one. Radiance is that at the coat.
@@ -69,7 +69,7 @@ def direct_light(
 
 
 def ggx(mi: Any, alpha: float, n: Any, wi: Any, wo: Any) -> Any:
-    """Microfacet reflectance D G / (4 cos θ_i cos θ_o) of a perfect mirror with GGX roughness (Walter et al. 2007, eq. 20, 33, 34)."""
+    """GGX reflectance D G / (4 cos θ_i cos θ_o) of a mirror (Walter et al. 2007, eq. 20, 33)."""
     h = dr.normalize(wi + wo)
     ci, co, ch = dr.dot(n, wi), dr.dot(n, wo), dr.dot(n, h)
     a2 = alpha * alpha

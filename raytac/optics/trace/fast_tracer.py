@@ -1,4 +1,4 @@
-"""``FastTracer``: the deterministic ray tracer. Direct light by quadrature and a smooth field of inter-reflection, batched."""
+"""``FastTracer``: quadrature over the LEDs and a smooth field of inter-reflection, batched."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class FastArrays:
 
 
 class FastTracer(Tracer):
-    """The integrator ``fast``: the same image for the same surface, B at a time, on the device if asked."""
+    """The integrator ``fast``: no noise; B surfaces at a time, on the device if asked."""
 
     @property
     def samples(self) -> int:
@@ -134,7 +134,7 @@ class FastTracer(Tracer):
         return inked_albedo(self.sensor, ink_at(self.mi, self.layout, inputs.ink, seen.env, seen.p.x, seen.p.y))
 
     def _radiosity(self, field: CoatField, inputs: FrameInputs, seen: PixelSample) -> list[Any]:
-        """Direct radiosity B of the coat at a sample, a channel each, for the coat's own inter-reflection."""
+        """Direct radiosity B of the coat at a sample, by channel, for its own inter-reflection."""
         mi, coat, albedo = self.mi, self.sensor.coat, self._albedo(seen, inputs)
         out = [mi.Float(0) for _ in range(3 * len(self.layer_names))]
         for lamp, group in zip(inputs.own.lamps, self.groups, strict=True):
@@ -145,7 +145,7 @@ class FastTracer(Tracer):
 
 
 def with_exposure(sensor: SensorSpec, device: str = "auto") -> SensorSpec:
-    """``sensor`` with a number in place of an exposure of ``AUTO``: ``mid_grey_exposure`` of its image at rest by ``fast``.
+    """``sensor`` with the ``mid_grey_exposure`` of its image at rest in place of ``AUTO``.
 
     That image has the sensor's own resolution and one ray a pixel, whatever else is rendered, so that every mode finds the same number.
     Raises SpecError: no exposure makes that image mid-grey; BackendError: Mitsuba cannot run on ``device``.

@@ -39,7 +39,7 @@ REACH = 7
 TILT = 1.2
 """Largest tangent of a normal's tilt in the fit."""
 _BULGE = 0.2
-"""Height of a bulge over the gel's thickness up to which what is in view is known: more than a gel that cannot be compressed shows."""
+"""Height of a bulge over the gel's thickness up to which what is in view is known."""
 _RAYS = 33
 """Camera rays along a side of the image that tell which patches are in view."""
 
@@ -50,14 +50,14 @@ def _monomials(u: Any, v: Any) -> list[Any]:
 
 @dataclass(frozen=True)
 class CaseLight:
-    """Irradiance from the case as a polynomial: ``coefficients`` (3·G, terms, 4) over monomials in x, y and (1, n_x, n_y, n_z)."""
+    """Irradiance from the case: ``coefficients`` (3·G, terms, 4) of x, y and (1, n_x, n_y, n_z)."""
 
     coefficients: np.ndarray
     half: tuple[float, float]
 
     @classmethod
     def fit(cls, scene: SensorScene, lamps: list[Lamp], groups: list[int], seed: int = 0, samples: int = SAMPLES) -> CaseLight:
-        """Path-trace from random points of the coat at rest into its hemisphere and fit by least squares.
+        """Path-trace from random points of the coat at rest, and fit by least squares.
 
         Directions are cosine-distributed about random normals, so a path's π L estimates E; directions into the pad's plane count as
         dark here, because ``BounceField`` brings the coat's own light.
@@ -92,7 +92,7 @@ class CaseLight:
         return cls(solution.T.reshape(len(irradiance), terms, 4).astype(np.float32), half)
 
     def on(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """(e, v_x, v_y, v_z) of E(n) = e + n · v at the places x, y [m], shape (channels, N, 4), float32."""
+        """(e, v_x, v_y, v_z) of E(n) at the places x, y [m], shape (channels, N, 4), float32."""
         monomials = np.stack(_monomials(x / self.half[0], y / self.half[1]), axis=-1)
         return np.einsum("nm,cmk->cnk", monomials, self.coefficients).astype(np.float32)
 
@@ -105,7 +105,7 @@ def patches_of(layout: CoatLayout) -> NodeGrid:
 
 
 def patches_in_view(g: NodeGrid, camera: Pinhole, thickness: float) -> tuple[int, int, int, int]:
-    """First column, first row, columns and rows of the patches between which a camera's pixels see the coat of a gel.
+    """First column, first row, columns and rows of the patches that a camera sees of a gel.
 
     It is as thick [m] at most as at rest and a bulge.
     """
@@ -124,7 +124,7 @@ def patches_in_view(g: NodeGrid, camera: Pinhole, thickness: float) -> tuple[int
 
 @dataclass(frozen=True)
 class BounceField:
-    """E(n) = max(0, e + n · v) of all indirect light on a coarse grid over the pad, computed each frame.
+    """E(n) = max(0, e + n · v) of all indirect light on a coarse grid over the pad, by frame.
 
     (e, v) of the case is fixed; the coat's own light is added to v. A pixel reads both by bilinear interpolation and its own normal. It is
     gathered for the patches in view and the channels that have light: LEDs of one colour leave the others of their layer dark.
@@ -153,13 +153,13 @@ class BounceField:
 
     @staticmethod
     def memory_per_env(layout: CoatLayout, camera: Pinhole, thickness: float, lit: Sequence[int]) -> int:
-        """Bytes that the grid takes while it is filled: packed results of each lit channel, patches, their light, heights."""
+        """Bytes of the grid while it is filled: results, patches, their light and heights."""
         g = patches_of(layout)
         _, _, columns, rows = patches_in_view(g, camera, thickness)
         return 16 * len(lit) * columns * rows + g.nx * g.ny * (16 + 16 * -(-len(lit) // 4) + 4)
 
     def gather_light(self, mi: Any, field: CoatField, radiosity: Callable[[PixelSample], list[Any]], envs: Any) -> list[Any]:
-        """Packed (e, v_x, v_y, v_z) of the patches in view of the coat ``field``, an array a lit channel.
+        """Packed (e, v_x, v_y, v_z) of the patches in view of ``field``, an array a lit channel.
 
         ``radiosity``: B [radiance · sr] of every channel at a sample.
         """

@@ -1,4 +1,4 @@
-"""LEDs: how they emit (``lobe_gain``), their arrays on the device (``Lamp``), and the emitter that Mitsuba's scene has of them.
+"""LEDs: how they emit (``lobe_gain``), on the device (``Lamp``), and as Mitsuba's emitter.
 
 A die behind a lens does not emit like a Lambertian patch. The usual lobe is an intensity I(θ) = I₀ cosⁿ θ about the axis; spread over
 a rectangle of area A this is the radiance L(θ) = (I₀ / A) cosⁿ⁻¹ θ, because a patch shrinks with cos θ. n = 1 is Mitsuba's ``area``.
@@ -21,7 +21,7 @@ LEAST_COSINE = 1e-6
 
 
 def lobe_gain(ops: Any, cos_theta: Any, exponent: Any, least: float = LEAST_COSINE) -> Any:
-    """cosⁿ θ of a lobe; ``ops`` is NumPy or Dr.Jit, as the arrays are. The caller leaves out what lies behind the LED.
+    """cosⁿ θ of a lobe by ``ops``, NumPy or Dr.Jit; the caller leaves out what lies behind.
 
     n is ``lobe`` for the intensity and ``lobe`` − 1 for the radiance.
     """
@@ -36,10 +36,10 @@ def lobe_slopes(cos_theta: np.ndarray, exponent: float, least: float) -> tuple[n
 
 @dataclass(frozen=True)
 class Lamp:
-    """Dr.Jit arrays of one LED: centre [m], unit axis, half edges [m], lobe exponent n, on-axis intensity (linear RGB) [W/sr], and the
-    even radiance of the case that goes with it (linear RGB) [W/(m² sr)], None if there is none.
+    """Dr.Jit arrays of one LED, and the even radiance of the case that goes with it.
 
-    Intensity is I(θ) = power · cosⁿ θ for the whole rectangle, so a small one is a point light of that intensity.
+    Centre [m], unit axis, half edges [m], lobe exponent n, on-axis intensity (linear RGB) [W/sr]; radiance (linear RGB) [W/(m² sr)],
+    None if there is none. Intensity is I(θ) = power · cosⁿ θ for the whole rectangle, so a small one is a point light.
     """
 
     centre: Any
@@ -52,7 +52,7 @@ class Lamp:
 
     @classmethod
     def from_spec(cls, mi: Any, led: LedSpec, unit: float = 1.0) -> Lamp:
-        """The LED in a world of ``unit`` length units per metre; its power grows with unit², so that I / r² stays."""
+        """The LED in ``unit`` length units per metre; power grows with unit², so that I / r² stays."""
         u, v = np.array(led.edges)
         lamp = cls(
             centre=mi.Point3f([unit * c for c in led.position]),
@@ -112,7 +112,7 @@ class LampTable:
 
 
 def register(mi: Any) -> None:
-    """Register the plugin ``raytac_led`` for the variant that is active in ``mi``, once; parameters ``radiance`` (RGB) and ``lobe``."""
+    """Register ``raytac_led`` (``radiance``, ``lobe``) for the variant active in ``mi``, once."""
     if getattr(mi, "raytac_led_variant", None) == mi.variant():
         return
 

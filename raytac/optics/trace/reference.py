@@ -1,4 +1,4 @@
-"""The ``reference`` integrator: unbiased path tracing over the sensor's Mitsuba scene, one radiance layer per LED colour.
+"""The ``reference`` integrator: unbiased path tracing, one radiance layer per LED colour.
 
 Paths start at the camera. At the coat point that it sees each LED is sampled once, uniformly over its rectangle (next-event estimation,
 area form of the rendering equation, Kajiya 1986; Shirley, Wang and Zimmerman 1996). Light that comes over the case is found from the
@@ -44,11 +44,11 @@ class ReferenceIntegrator:
     scene: SensorScene
     camera: Pinhole
     max_depth: int = -1
-    """Number of reflections by coat or case, not by the slab's face: 1 is direct light only, −1 has no limit."""
+    """Most reflections by coat or case, not by the slab's face: 1 is direct light, −1 no limit."""
     progress: bool = False
 
     def render(self, lamps: list[Lamp], groups: list[int], spp: int, seed: int) -> np.ndarray:
-        """Mean radiance (G, H, W, 3) of the scene as it stands; ``groups`` gives for each lamp the layer in 0 … G−1 that it lights.
+        """Mean radiance (G, H, W, 3) of the scene; ``groups``: layer 0 … G−1 that each lamp lights.
 
         Samples are uniform in each pixel's square (box filter); ``spp`` samples a pixel, ``seed`` fixes them.
         """
@@ -60,7 +60,7 @@ class ReferenceIntegrator:
 
 
 class StockPathIntegrator(ReferenceIntegrator):
-    """Mitsuba's own ``path`` over the same scene: an independent check of ``reference``, and the peer to measure speed against."""
+    """Mitsuba's own ``path`` over the same scene: a check of ``reference``, and a peer in speed."""
 
     def render(self, lamps: list[Lamp], groups: list[int], spp: int, seed: int) -> np.ndarray:
         """As ``ReferenceIntegrator.render``; one run a layer, with the other layers' LEDs dark."""
@@ -82,7 +82,7 @@ class StockPathIntegrator(ReferenceIntegrator):
 def accumulate(
     mi: Any, camera: Pinhole, radiance: Callable[[Any, Any], list[Any]], spp: int, seed: int, progress: bool
 ) -> np.ndarray:
-    """Mean of ``radiance(sampler, ray)`` (3·G channels) over ``spp`` rays uniform in each pixel's square; (G, H, W, 3), float32."""
+    """Mean of ``radiance(sampler, ray)`` over ``spp`` rays a pixel; (G, H, W, 3), float32."""
     width, height = camera.resolution
     per_launch = max(1, min(spp, LAUNCH // (width * height)))
     template = mi.load_dict({"type": "independent"})
@@ -127,7 +127,7 @@ def trace(
     def vertex(
         sampler: Any, si: Any, beta: Any, radiance: list[Any], deeper: Any, active: Any, mirrored: Any = None
     ) -> list[Any]:
-        """Light at a vertex from one random LED: straight if it lies on the coat or was ``mirrored``, and over one point of the case."""
+        """Light at a vertex from a random LED: straight on the coat or if ``mirrored``; by the case."""
         lamp, group = table.pick(mi, sampler.next_1d(active))
         weight = beta * len(lamps)
         direct = scene.on_coat(si) if mirrored is None else scene.on_coat(si) | mirrored
@@ -217,7 +217,7 @@ def trace(
 
 
 def enter(mi: Any, slab: Slab, ray: Any) -> tuple[Any, Any, tuple[Any, Any]]:
-    """Split a camera ray in air at the slab's face: (ray in the gel, its weight T / n², (mirrored ray, its weight 1 − T))."""
+    """Split a camera ray at the slab's face: (ray in gel, weight T / n², (mirrored ray, 1 − T))."""
     o = ray.o + ray.d * ((slab.z - ray.o.z) / ray.d.z)
     o.z = mi.Float(slab.z)
     d, loss = slab.refract(mi, ray.d)
@@ -249,7 +249,7 @@ def advance(mi: Any, scene: SensorScene, sampler: Any, ray: Any, active: Any) ->
 
 
 def hidden(mi: Any, scene: SensorScene, start: Any, end: Any, link: Link, active: Any) -> Any:
-    """True if something blocks a leg of ``link`` between the interaction ``start`` and the point ``end``."""
+    """True if something blocks a leg of ``link`` between interaction ``start`` and ``end``."""
     active = mi.Bool(active)
     blocked = scene.scene.ray_test(start.spawn_ray_to(dr.select(link.bent, link.via, end)), active)
     leg = end - link.via
@@ -260,9 +260,9 @@ def hidden(mi: Any, scene: SensorScene, start: Any, end: Any, link: Link, active
 
 
 def lit_by(mi: Any, scene: SensorScene, sampler: Any, si: Any, lamp: Lamp, beta: Any, active: Any, mirror: bool = False) -> Any:
-    """beta · f · I cosⁿ θ_led / r² (RGB) at ``si`` for one random point of ``lamp``, 0 in its shadow; f includes the cosine.
+    """beta · f · I cosⁿ θ_led / r² (RGB) at ``si`` for a random point of ``lamp``; 0 in shadow.
 
-    With a slab 1 / r² becomes the link's gain, refracted where si is in the gel; ``mirror`` takes the LED's image in the slab's face.
+    f includes the cosine. With a slab 1 / r² becomes the link's gain, refracted where si is in the gel; ``mirror`` takes the LED's image in the slab's face.
     """
     light = lamp.sample(sampler.next_2d(active))
     if scene.slab is None:
@@ -281,7 +281,7 @@ def lit_by(mi: Any, scene: SensorScene, sampler: Any, si: Any, lamp: Lamp, beta:
 
 
 def connect(mi: Any, scene: SensorScene, sampler: Any, p: Any, n: Any, lamp: Lamp, active: Any) -> tuple[Any, Any]:
-    """Light of ``lamp`` that reaches ``p`` over one random point y of the case: its direction and its strength (RGB).
+    """Light of ``lamp`` at ``p`` over a random point y of the case: direction, strength (RGB).
 
     A ray leaves the LED by its own lobe (pdf (n + 1) / 2π cosⁿ θ, so it carries the flux Φ = 2π I / (n + 1)) and meets the case at y,
     which is joined to p: the strength is Φ · ρ / π · cos θ_y · V / r², to be multiplied by the receiver's cosine and reflectance. Bright

@@ -1,4 +1,4 @@
-"""``SampledTracer``: path tracing, by our ``reference`` or by Mitsuba's ``path``; one environment at a time, with noise."""
+"""``SampledTracer``: path tracing, ours or Mitsuba's, one environment at a time, with noise."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _GLANCE = 16
 
 
 def image_seed(seed: int, env: int) -> int:
-    """Seed of environment ``env``: ``seed`` itself for the first, unrelated streams for the others."""
+    """Seed of environment ``env``: ``seed`` for the first, unrelated streams for the others."""
     return (seed + env * 0x9E3779B1) & 0xFFFFFFFF
 
 
@@ -44,7 +44,7 @@ class SampledTracer(Tracer):
         return self.config.spp or 256
 
     def render(self, surface: GelSurface, *, spp: int | None = None, seed: int | None = None) -> OpticsImages:
-        """As ``DeviceMode.render``, with ``spp`` samples a pixel and random numbers of ``seed``; None is as the tracer was built."""
+        """As ``DeviceMode.render``, with ``spp`` samples a pixel and ``seed``; None is as built."""
         heights, failed = self._checked(surface)
         images: dict[str, Any] = {}
         if self._lit:
@@ -57,7 +57,7 @@ class SampledTracer(Tracer):
         return self._images(surface, failed, images, points)
 
     def start(self, surface: GelSurface) -> Callable[[], OpticsImages]:
-        """As ``DeviceMode.start``, but the images are there at once: samples are summed up on the host."""
+        """As ``DeviceMode.start``, but the images are there at once, summed up on the host."""
         images = self.render(surface)
         return lambda: images
 
@@ -112,7 +112,7 @@ class SampledTracer(Tracer):
 def ray_tracer(
     sensor: SensorSpec, config: RayTraced, *, outputs: tuple[str, ...] = ("rgb",), device: str = "auto", **settings: Any
 ) -> Tracer:
-    """The tracer of a configuration, for a sensor whose exposure is ``AUTO`` with the number that it stands for."""
+    """The tracer of a configuration, for a sensor whose ``AUTO`` exposure becomes a number."""
     if config.sampled and not casts_shadows(sensor, config.shadows):
         name = config.integrator
         text = f"optics.shadows = false of sensor {sensor.name!r} is for 'fast': {name!r} casts shadows as light does"

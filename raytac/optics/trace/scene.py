@@ -1,4 +1,4 @@
-"""The Mitsuba scene of a sensor: coat mesh, LEDs, walls and floor. Loaded once; then only vertices and LED powers change.
+"""The Mitsuba scene of a sensor, loaded once; then only vertices and LED powers change.
 
 Repeated ``load_dict`` leaks memory (mitsuba3 #1890), so a process builds this once a sensor. This is the only file that touches
 mesh parameters, whose names change in Mitsuba 3.10.
@@ -19,15 +19,15 @@ from raytac.optics.trace.led import PLUGIN, Lamp, lobe_gain
 from raytac.specs.sensor import CoatSpec, LedSpec, SensorSpec
 
 UNIT = 1e3
-"""Scene units per metre. Mitsuba starts secondary rays 9e-5 scene units off a surface (``offset_p``): in metres that is 0.09 mm, more
-than a pixel on the pad, so the scene is built in millimetres."""
+"""Scene units per metre: millimetres, since Mitsuba starts secondary rays 9e-5 units off.
+In metres that (``offset_p``) is 0.09 mm, more than a pixel on the pad."""
 
 PLATES = ("wall_left", "wall_right", "wall_top", "wall_bottom", "floor")
 """The rectangles of the case: its walls at −x, x, −y and y, and its floor."""
 
 
 def coat_bsdf(coat: CoatSpec, *, dotted: bool = False) -> dict[str, Any]:
-    """Mitsuba's dictionary of the coat: a Lambertian base blended with a rough conductor of full reflectance.
+    """Mitsuba's dictionary of the coat: Lambertian, blended with a rough perfect conductor.
 
     The blend gives f = (1 − s) ρ / π + s · D G / (4 cos θ_i cos θ_o), the same f that the fast integrator evaluates. With ``dotted``, ρ
     is the mesh's attribute ``vertex_albedo``.
@@ -41,7 +41,7 @@ def coat_bsdf(coat: CoatSpec, *, dotted: bool = False) -> dict[str, Any]:
 
 
 def grid_faces(nx: int, ny: int) -> np.ndarray:
-    """Triangles (2 (nx−1) (ny−1), 3) over nodes in row order, wound so that their normals point to −z when x is right and y down."""
+    """Triangles (2 (nx−1) (ny−1), 3) over nodes in row order, normals to −z, x right, y down."""
     corner = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)[None, :]).ravel()
     lower = np.stack([corner, corner + nx, corner + 1], axis=1)
     upper = np.stack([corner + 1, corner + nx, corner + nx + 1], axis=1)
@@ -49,7 +49,7 @@ def grid_faces(nx: int, ny: int) -> np.ndarray:
 
 
 class SensorScene:
-    """One sensor's geometry and lights in Mitsuba; ``set_surface`` and ``set_layers`` are all that changes."""
+    """One sensor's geometry and lights in Mitsuba; ``set_surface`` and ``set_layers`` change it."""
 
     def __init__(self, mi: Any, sensor: SensorSpec, grid: PadGrid, *, glass: bool = False) -> None:
         """``grid``: nodes of the coat mesh [m], which starts at rest.
@@ -151,14 +151,14 @@ class SensorScene:
         return np.stack(inked_albedo(self.sensor, share), axis=-1).astype(np.float32).ravel()
 
     def set_surface(self, height: np.ndarray, ink: np.ndarray | None = None) -> None:
-        """Move the coat's nodes to ``height`` (Ny, Nx) [m], with the share ``ink`` of dots; Mitsuba rebuilds what depends on them."""
+        """Move the coat's nodes to ``height`` (Ny, Nx) [m], with the share ``ink`` of dots."""
         self.params["coat.vertex_positions"] = self.mi.Float(self._vertices(height))
         if self._dotted:
             self.params["coat.vertex_albedo"] = self.mi.Float(self._albedo(ink))
         self.params.update()
 
     def height_at(self, x: Any, y: Any) -> Any:
-        """z of the coat mesh as it stands at device points x, y, in scene units: a ray from the camera's side along +z."""
+        """z of the coat mesh at device points x, y, in scene units, by a ray along +z."""
         mi = self.mi
         below = -UNIT * self.sensor.gelpad.thickness
         hit = self.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(x, y, below), mi.Vector3f(0, 0, 1)))
@@ -176,7 +176,7 @@ class SensorScene:
         self.params.update()
 
     def reflect(self, si: Any, wo: Any) -> Any:
-        """f(wi, wo) cos θ_o (RGB) of whatever was hit: coat, wall, or 0 for an LED; far faster than through Mitsuba's virtual calls."""
+        """f(wi, wo) cos θ_o (RGB) of coat, wall or LED (0); faster than by Mitsuba's virtual calls."""
         mi = self.mi
         coat = self._coat_bsdf.eval(self._context, si, wo)
         wall = mi.Color3f(self.case_albedo(si) / dr.pi * dr.maximum(wo.z, 0))
@@ -192,7 +192,7 @@ class SensorScene:
         return dr.select(on_coat, sample.wo, cosine), dr.select(on_coat, weight, wall)
 
     def led_radiance(self, si: Any, index: int, lamp: Lamp) -> Any:
-        """Radiance (RGB) that LED ``index``, given as ``lamp`` in scene units, sends back along the ray that hit ``si``; 0 elsewhere."""
+        """Radiance (RGB) of LED ``index`` (``lamp`` in scene units) back along the ray to ``si``."""
         area = 4 * dr.norm(lamp.half_u) * dr.norm(lamp.half_v)
         front = (si.shape == self._leds[index]) & (si.wi.z > 0)
         lobe = lobe_gain(dr, si.wi.z, lamp.lobe - 1)

@@ -1,4 +1,4 @@
-"""``Tracer``: what the deterministic and the sampled ray tracer share: LEDs, layers, camera response, flat field."""
+"""``Tracer``: LEDs, layers, camera response and flat field that all ray tracers share."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def total(layers: dict[str, np.ndarray]) -> np.ndarray:
 
 
 class Tracer(DeviceMode):
-    """Base of the ray tracers: one sensor, one resolution, one scene. ``seed`` is of path tracing and of the fit of the case's light."""
+    """Base of the ray tracers of one sensor and resolution; ``seed``: paths and the case's fit."""
 
     config: RayTraced
 
@@ -55,7 +55,7 @@ class Tracer(DeviceMode):
 
     @abstractmethod
     def _rest_image(self, rest: np.ndarray) -> np.ndarray:
-        """8-bit image (H, W, 3) of the surface at ``rest`` (1, Ny, Nx), exact enough to tell how much of it is white."""
+        """8-bit image (H, W, 3) of ``rest`` (1, Ny, Nx), exact enough to count white pixels."""
 
     def _rest_light(self, rest: np.ndarray) -> np.ndarray:
         """Linear image (H, W, 3) of the surface at ``rest`` (1, Ny, Nx)."""
@@ -63,7 +63,7 @@ class Tracer(DeviceMode):
 
     @property
     def sampling(self) -> dict[str, int | float | str]:
-        """``integrator``, ``spp`` and ``exposure``, for headers; the exposure is absent where it is ``AUTO`` and no output needs it."""
+        """``integrator``, ``spp`` and ``exposure`` for headers; no exposure while it is ``AUTO``."""
         exposure = self.sensor.response.exposure
         known = {"exposure": float(exposure)} if is_number(exposure) else {}
         return {"integrator": self.config.integrator, "spp": self.samples, **known}
@@ -97,7 +97,7 @@ class Tracer(DeviceMode):
             self.response.set_flat_field(self.config.flat_field, self._rest_light(grid.rest[None].astype(np.float32)))
 
     def _warn_if_saturated(self, grid: PadGrid) -> None:
-        """Warn of an image at rest that is white over a large part, and name the exposure that would make it mid-grey."""
+        """Warn of an image at rest that is largely white, and name the mid-grey exposure."""
         rest = grid.rest[None].astype(np.float32)
         if (share := saturated_share(self._rest_image(rest))) <= SATURATED:
             return

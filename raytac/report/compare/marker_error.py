@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from raytac.markers.calibration_presses import PressFrame
 
 PAD = "medium"
-"""Level of the soft pad where none is asked for: the one that shipped marker motion was fitted to."""
+"""Level of the soft pad by default: the one that shipped marker motion was fitted to."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class MarkerErrors:
     errors: tuple[ModelError, ...]
     """By model and kind of load; the model ``surface`` has no row, since it is the truth."""
     times_ms: dict[str, float]
-    """Median time of a frame of every model at the probes [ms]; of ``surface`` too, without the physics."""
+    """Median time of a frame by model at the probes [ms]; of ``surface`` without the physics."""
 
     @property
     def loads(self) -> tuple[str, ...]:

@@ -59,8 +59,8 @@ class Summary:
     memory_mib: float | None
     memory_mib_per_env: float | None
     errors: dict[str, float]
-    """``frame_mae`` …: means over scenes; RMSE and the PSNR that follows from it: over the mean square; worst scene's PSNR:
-    ``frame_psnr_worst``."""
+    """Means over scenes, such as ``frame_mae``; RMSE, and PSNR by it, over the mean square.
+    ``frame_psnr_worst`` is the PSNR of the worst scene."""
     at_noise: bool
     """True if the noise of the reference makes up half of the mean square error in some scene."""
 

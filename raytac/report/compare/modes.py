@@ -47,9 +47,9 @@ class Mode:
     options: str = ""
     """Settings as they go into the key of a row."""
     prepare: Callable[[Setting], object] | None = None
-    """Work before the first image whose result stays on disk for later processes, such as baking a table; it is not timed."""
+    """Untimed work whose result stays on disk for later processes, such as baking a table."""
     has_reference: bool = True
-    """True if the image shows our sensor, so that its error against our reference means something."""
+    """True if the image shows our sensor, so that an error against our reference is defined."""
     note: str = ""
     """Remark for readers of its rows."""
 

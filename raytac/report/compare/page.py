@@ -13,16 +13,14 @@ from raytac.report.compare.run import REGIONS, Comparison
 from raytac.report.image_error import FLIP_PPD, RING_WIDTH, has_flip
 
 FILES = ("report.html", "pareto.png", "results.parquet", "metrics.json")
-"""Files of every comparison, besides ``sheet_<scene>_<resolution>.png``, ``rows/`` and ``references/``."""
+"""Files of every comparison besides sheets of scenes, ``rows/`` and ``references/``."""
 TEMPLATE = "compare_report.html.j2"
 
 
 def write_comparison(comparison: Comparison, out: Path, wall_s: float) -> list[Path]:
     """Write all files of the report into ``out`` at once, in place of those of an earlier run.
 
-    Sheets of other scenes are removed.
-
-    Returns the files written. ``wall_s`` is the time of this run.
+    Sheets of other scenes are removed. Returns the files written. ``wall_s`` is the time of this run.
     """
     from raytac.report.compare.figures import write_pareto, write_sheet_of_scene
 

@@ -20,10 +20,8 @@ AWAY_MM = 5.0
 def contact_height_map(surface: GelSurface, size: tuple[int, int], width_mm: float) -> np.ndarray:
     """Object's underside for the package: (B, H, W) float32 [mm], 0 at the gel's top.
 
-    Negative inside.
-
-    Where there is contact the gel's surface is the object's underside; elsewhere the object counts as ``AWAY_MM`` off, since the package
-    deforms the gel by itself. Pixels are squares of ``width_mm`` / W, centred on the pad.
+    Negative inside. Where there is contact the gel's surface is the object's underside; elsewhere the object counts as ``AWAY_MM`` off,
+    since the package deforms the gel by itself. Pixels are squares of ``width_mm`` / W, centred on the pad.
     """
     width, height = size
     pitch = 1e-3 * width_mm / width
@@ -48,7 +46,7 @@ class PeerTaxim:
     """The package ``taxim`` with its own sensor, as an ``OpticalMode``: only its time compares."""
 
     def __init__(self, size: tuple[int, int], *, shadow: bool, device: str) -> None:
-        """``size`` (width, height) [px]; ``device`` ``cpu`` or ``cuda``; on CUDA it needs a JAX that was built for it.
+        """``size`` (width, height) [px]; ``device``: ``cpu``, or ``cuda`` with a JAX built for it.
 
         Raises:
             BackendError: the package or JAX is not installed or does not start on ``device``.

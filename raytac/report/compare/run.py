@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode
 
 REGIONS = ("frame", "contact", "ring", "box")
-"""Parts of an image over which errors are taken, as ``raytac.report.image_error.regions`` makes them."""
+"""Parts of an image that errors are taken of, by ``raytac.report.image_error.regions``."""
 BATCH = {"cpu": 8, "cuda": 64}
 """Environments of the batched timing where none are asked for."""
 TURNS = 6

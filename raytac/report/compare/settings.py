@@ -42,7 +42,7 @@ class CompareSettings:
     pad: str | None = None
     """Level of the soft pad that the rigid one is measured against; None leaves those rows out."""
     markers: bool = False
-    """Measure the marker models against surface tracking too, on the soft pad of level ``pad``, else ``marker_error.PAD``."""
+    """Also measure marker models against surface tracking, on level ``pad`` or the default."""
 
     def quickened(self) -> CompareSettings:
         """The first scene at 80 x 60 pixels with few samples, frames and modes."""

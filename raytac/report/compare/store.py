@@ -98,7 +98,7 @@ class References:
     def __init__(
         self, folder: Path, tracers: Tracers, size: tuple[int, int], spp: int, say: Callable[[str], object] = print
     ) -> None:
-        """``spp`` samples a pixel in both halves together, at least 2; ``say`` tells what is computed and what was unreadable."""
+        """``spp``: samples a pixel of both halves together, at least 2; ``say``: for messages."""
         self.folder, self.tracers, self.size, self.spp, self.say = Path(folder), tracers, size, spp, say
         spec = replace(tracers.spec, source=None, lights=replace(tracers.spec.lights, source=None))
         basis = [repr(spec), repr(size), str(spp), str(tracers.seed), tracers.device]
