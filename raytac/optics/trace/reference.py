@@ -262,7 +262,8 @@ def hidden(mi: Any, scene: SensorScene, start: Any, end: Any, link: Link, active
 def lit_by(mi: Any, scene: SensorScene, sampler: Any, si: Any, lamp: Lamp, beta: Any, active: Any, mirror: bool = False) -> Any:
     """beta · f · I cosⁿ θ_led / r² (RGB) at ``si`` for a random point of ``lamp``; 0 in shadow.
 
-    f includes the cosine. With a slab 1 / r² becomes the link's gain, refracted where si is in the gel; ``mirror`` takes the LED's image in the slab's face.
+    f includes the cosine. With a slab 1 / r² becomes the link's gain, refracted where si is in the gel; ``mirror`` takes the LED's image in
+    the slab's face.
     """
     light = lamp.sample(sampler.next_2d(active))
     if scene.slab is None:
