@@ -13,7 +13,7 @@ import numpy as np
 
 from raytac.gel.surface import PadGrid, rest_height
 from raytac.markers.calibration_presses import LOADS, PressFrame
-from raytac.markers.contacts import ContactCells, Contacts, ContactTracker
+from raytac.markers.contacts import TWIST_SLIP, ContactCells, Contacts, ContactTracker
 from raytac.markers.force_field import contact_at
 from raytac.markers.pattern import marker_centres
 from raytac.markers.registry import models_without_coat
@@ -123,7 +123,7 @@ def fit_motion(data: ProbeData, *, device: str = "auto") -> MarkerMotionSpec:
     are fitted once as published and once as a punch (``PunchSpec``), whose three constants they share. A cap is no more than the largest
     motion in the data, since no larger one was measured.
     """
-    from raytac.markers.fots import TWIST_SLIP, FotsKernel
+    from raytac.markers.fots import FotsKernel
 
     kernel = FotsKernel(data.cells.x, data.cells.y, device=device)
 

@@ -1,4 +1,4 @@
-"""Nodes that stand for a contact's samples in FOTS' dilation."""
+"""FOTS' dilation against the sum over all samples."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from raytac.markers.fots import FotsKernel
-from raytac.markers.sources import SourceLine, anterpolated, coarsening
-from raytac.specs import load_sensor
 from tests.markers.pads import MOTION
 
 X, Y = (0.4e-3 * (np.arange(n) - 0.5 * (n - 1)) for n in (64, 53))
@@ -46,23 +44,20 @@ def test_markers_move_as_by_all_samples(decay: float) -> None:
     np.testing.assert_allclose(moved, gain * unit, rtol=0, atol=1e-9)
 
 
-def test_a_wide_gaussian_needs_few_nodes_and_a_narrow_one_all() -> None:
-    motion = load_sensor("gelsight_mini_9x11").marker_motion
-    assert motion is not None
-    assert coarsening(X, motion.dilate_lambda) == 3
-    line = SourceLine.of(X, motion.dilate_lambda)
-    assert line.count == 22 - 1 + 8
-    assert coarsening(X, 1e6) == 1
-    assert SourceLine.of(X, 1e6).weights is None
-
-
 def test_a_pad_does_not_depend_on_its_neighbours_to_the_last_bit() -> None:
-    depth, x, y = depths(), SourceLine.of(X, 1.8e4), SourceLine.of(Y, 1.8e4)
-    together = np.zeros((len(BOXES), y.count, x.count), np.float32)
-    edges = anterpolated(depth, BOXES, x, y, together)
+    depth, motion = depths(), replace(MOTION, dilate_gain=1e8, dilate_lambda=4e4)
+    together = FotsKernel(X, Y, device="cpu").displacement(np.tile(MARKERS, (len(BOXES), 1, 1)), depth, BOXES, NO_CONTACT, motion)
     for b in range(len(BOXES)):
-        alone = np.zeros((1, y.count, x.count), np.float32)
-        np.testing.assert_array_equal(anterpolated(depth[b : b + 1], BOXES[b : b + 1], x, y, alone)[0], edges[b])
-        c0, c1, r0, r1 = edges[b].tolist()
-        np.testing.assert_array_equal(alone[0, r0:r1, c0:c1], together[b, r0:r1, c0:c1])
-        assert not np.delete(together[b], np.s_[c0:c1], axis=1).any() and not np.delete(together[b], np.s_[r0:r1], axis=0).any()
+        some = slice(b, b + 1)
+        alone = FotsKernel(X, Y, device="cpu").displacement(MARKERS[None], depth[some], BOXES[some], NO_CONTACT[some], motion)
+        np.testing.assert_array_equal(alone[0], together[b])
+
+
+def test_each_call_takes_its_own_motion() -> None:
+    kernel, depth = FotsKernel(X, Y, device="cpu"), depths()
+    markers = np.tile(MARKERS, (len(BOXES), 1, 1))
+    weak, strong = (replace(MOTION, dilate_gain=gain, dilate_lambda=4e4) for gain in (1e8, 2e8))
+    moved = [kernel.displacement(markers, depth, BOXES, NO_CONTACT, motion) for motion in (weak, strong, weak)]
+    assert np.abs(moved[0]).max() > 1e-6
+    np.testing.assert_allclose(moved[1], 2.0 * moved[0], rtol=1e-5)
+    np.testing.assert_array_equal(moved[2], moved[0])
