@@ -60,6 +60,8 @@ MODES: dict[str, ObservationSettings | None] = {
 }
 
 
+TIMED = ("fots", "table32", "raytrace64")
+"""Modes that are timed if none is named."""
 ENGINES = ("auto", "mujoco", "mujoco_warp")
 BALL, BALL_KEY = "ball", "steps_per_s"
 BALL_STEPS = 3000
@@ -75,7 +77,7 @@ class Args(CommonOptions):
     envs: int = 16
     """Number of environments."""
     modes: str = ""
-    """What is observed, joined by commas; all but ``none`` if empty."""
+    """What is observed, joined by commas; fots, table32 and raytrace64, or with ``--frames`` all, if empty."""
     steps: int = 60
     """Steps, or calls with ``--frames``, that are timed, after a third as many to press the pad on or to record the kernels."""
     frames: bool = False
@@ -98,8 +100,8 @@ def main(args: Args) -> dict[str, Metric]:
     """Run all and write ``metrics.json``."""
     known = tuple(FRAMES) if args.frames else tuple(MODES)
     if args.against is not None:
-        return compare(args, parse_names(args.modes or ",".join((*MODES, BALL)), "modes", (*MODES, BALL)))
-    names = parse_names(args.modes or ",".join(name for name in known if name != "none"), "modes", known)
+        return compare(args, parse_names(args.modes or ",".join((*TIMED, BALL)), "modes", (*MODES, BALL)))
+    names = parse_names(args.modes or ",".join(FRAMES if args.frames else TIMED), "modes", known)
     device = resolve_device(args.device)
     check_known("engine", args.engine, ENGINES)
     on_device = args.engine == "mujoco_warp" or (args.engine == "auto" and device == "cuda" and not args.frames)

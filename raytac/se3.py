@@ -6,8 +6,10 @@ Poses that users give are checked here.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from array_api_compat import array_namespace
 from numpy.typing import ArrayLike
 
 from raytac.checks import check_numbers
@@ -134,15 +136,29 @@ def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
     return u @ v
 
 
-def rotations(vectors: np.ndarray) -> np.ndarray:
-    """Rotation matrices (…, 3, 3) of rotation vectors (…, 3) [rad] (Rodrigues' formula)."""
-    shape, vectors = vectors.shape, vectors.reshape(-1, 3)
-    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    half = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2  # (1 − cos a)/a²
-    return (np.eye(3) + np.sinc(angle / np.pi) * cross + half * cross @ cross).reshape(*shape, 3)
+def rotations(vectors: Any) -> Any:
+    """Rotation matrices (…, 3, 3) of rotation vectors (…, 3) [rad] (Rodrigues' formula); arrays of NumPy or PyTorch."""
+    xp = array_namespace(vectors)
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    angle = xp.sqrt(x * x + y * y + z * z)
+    some = angle > 0.0
+    length = xp.where(some, angle, 1.0)
+    first, half = xp.where(some, xp.sin(angle) / length, 1.0), xp.where(some, xp.sin(0.5 * angle) / (0.5 * length), 1.0)
+    second = 0.5 * half * half  # (1 − cos a)/a², without cancellation
+    xy, yz, zx = second * x * y, second * y * z, second * z * x
+    xx, yy, zz = (1.0 - second * (angle * angle - c * c) for c in (x, y, z))
+    sx, sy, sz = first * x, first * y, first * z
+    rows = (xx, xy - sz, zx + sy, xy + sz, yy, yz - sx, zx - sy, yz + sx, zz)
+    return xp.reshape(xp.stack(rows, axis=-1), (*vectors.shape[:-1], 3, 3))
+
+
+def poses_of(rotation: Any, position: Any) -> Any:
+    """``target_from_source`` (…, 4, 4) from rotation matrices (…, 3, 3) and positions (…, 3) [m]; arrays of NumPy or PyTorch."""
+    xp = array_namespace(rotation, position)
+    top = xp.concat([rotation, position[..., None]], axis=-1)
+    last = xp.zeros_like(top[..., :1, :])
+    last[..., 3] = 1.0
+    return xp.concat([top, last], axis=-2)
 
 
 def batch_of(world_from_pad: ArrayLike, axes: int, bodies: Mapping[str, ArrayLike]) -> int:

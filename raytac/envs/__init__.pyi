@@ -29,7 +29,7 @@ from .sb3 import ProcessVecEnv as ProcessVecEnv
 from .sb3 import TactileVecEnv as TactileVecEnv
 from .scripted import SCRIPTED as SCRIPTED
 from .task_rules import Motion as Motion
-from .task_rules import Start as Start
+from .task_rules import Starts as Starts
 from .task_rules import Task as Task
 from .task_rules import TaskResult as TaskResult
 from .task_rules import TaskState as TaskState

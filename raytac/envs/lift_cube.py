@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import numpy as np
+from array_api_compat import array_namespace
 
 from raytac.envs.environments import TactileEnv, TactileVectorEnv
-from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, distances, near
-from raytac.se3 import pose
+from raytac.envs.task_rules import Array, Motion, Starts, Task, TaskResult, TaskState, between, distances, moved, near, poses_at
 
 _LIFTED = 0.04
 """Height of the centre of a lifted cube [m]; at rest it is 0.015."""
@@ -29,17 +28,19 @@ class LiftCube(Task):
     )
     max_episode_steps: ClassVar = 250
     body_seen: ClassVar = True
+    draws: ClassVar = 5
 
-    def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
-        position = body[:3, 3] + [*rng.uniform(-0.03, 0.03, 2), 0.0]
-        goal = np.array([*(body[:2, 3] + rng.uniform(-0.05, 0.05, 2)), rng.uniform(0.08, 0.20)])
-        return Start(goal, {"object": pose(body[:3, :3], position)})
+    def starts(self, u: Array, tool: Array, body: Array) -> Starts:
+        position = moved(body[:3, 3], between(u[:, 0], -0.03, 0.03), between(u[:, 1], -0.03, 0.03))
+        goal = moved(body[:3, 3], between(u[:, 2], -0.05, 0.05), between(u[:, 3], -0.05, 0.05))
+        goal[:, 2] = between(u[:, 4], 0.08, 0.20)
+        return Starts(goal, {"object": poses_at(body, position)})
 
     def evaluate(self, state: TaskState) -> TaskResult:
-        cube = state.body[:, :3, 3]
+        xp, cube = array_namespace(state.body), state.body[:, :3, 3]
         reach, distance = distances(state.tool[:, :3, 3], cube), distances(cube, state.goal)
-        held = np.minimum(-state.wrench["left"][:, 2], -state.wrench["right"][:, 2]) > 0.5
-        rise = held * np.clip((cube[:, 2] - 0.0155) / (_LIFTED - 0.0155), 0.0, 1.0)
+        held = xp.minimum(-state.wrench["left"][:, 2], -state.wrench["right"][:, 2]) > 0.5
+        rise = held * xp.clip((cube[:, 2] - 0.0155) / (_LIFTED - 0.0155), 0.0, 1.0)
         terms = {
             "reaching": near(reach, 0.1),
             "reaching_fine": near(reach, 0.02),

@@ -1,13 +1,21 @@
-"""Rules of a task: motion of the tool, start, reward and end of an episode. Batches, SI units, world frame."""
+"""Rules of a task: motion of the tool, start, reward and end of an episode. Batches, SI units, world frame.
+
+Arrays are NumPy's, or PyTorch's on any device: rules are written once, by the functions that both have (array API standard).
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
-import numpy as np
+from array_api_compat import array_namespace
+
+from raytac.se3 import poses_of, rotations
+
+Array = Any
+"""Array of NumPy or PyTorch."""
 
 
 @dataclass(frozen=True)
@@ -38,36 +46,36 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Start:
-    """Start of one episode."""
+class Starts:
+    """Starts of n episodes."""
 
-    goal: np.ndarray
-    """Goal position (3,) [m]."""
-    bodies: dict[str, np.ndarray] = field(default_factory=dict)
-    """``world_from_body`` (4, 4) of bodies that do not start as in the scene."""
+    goal: Array
+    """Goal positions (n, 3) [m]."""
+    bodies: dict[str, Array] = field(default_factory=dict)
+    """``world_from_body`` (n, 4, 4) of bodies that do not start as in the scene."""
 
 
 @dataclass(frozen=True)
 class TaskState:
     """B environments after a step."""
 
-    tool: np.ndarray
+    tool: Array
     """Pose (B, 4, 4)."""
-    speed: np.ndarray
+    speed: Array
     """Mean velocity of the tool over the last step [m/s], (B, 3)."""
-    body: np.ndarray
+    body: Array
     """Pose (B, 4, 4) of the task's body."""
-    body_speed: np.ndarray
+    body_speed: Array
     """Mean velocity [m/s] and angular velocity [rad/s] of the body over the last step, (B, 6)."""
-    goal: np.ndarray
+    goal: Array
     """Goal positions (B, 3) [m]."""
-    wrench: Mapping[str, np.ndarray]
+    wrench: Mapping[str, Array]
     """Wrench (B, 6) of every sensor, pad frame."""
-    joint_speed: np.ndarray
+    joint_speed: Array
     """Joint speeds (B, n) [rad/s]."""
-    action: np.ndarray
+    action: Array
     """Action of this step (B, k)."""
-    last_action: np.ndarray
+    last_action: Array
     """Action of the step before (B, k)."""
 
 
@@ -75,11 +83,11 @@ class TaskState:
 class TaskResult:
     """Reward and end of a step, in B environments."""
 
-    terms: dict[str, np.ndarray]
+    terms: dict[str, Array]
     """Terms of the reward, each (B,); their sum is the reward."""
-    terminated: np.ndarray
+    terminated: Array
     """Episodes that end here, (B,), bool."""
-    success: np.ndarray
+    success: Array
     """Environments in which the task is done now, (B,), bool; this ends no episode."""
 
 
@@ -94,6 +102,8 @@ class Task(ABC):
     max_episode_steps: ClassVar[int]
     body_seen: ClassVar[bool]
     """Default of ``TaskBatch``'s ``body_seen``: the body's pose and velocity are observed."""
+    draws: ClassVar[int]
+    """Random numbers of a start."""
     tactile: ClassVar[tuple[str, ...]] = ("markers",)
     """Default modalities of every sensor."""
 
@@ -101,28 +111,70 @@ class Task(ABC):
     """Sensor whose pad carries the body at the start; None: something else does."""
 
     @abstractmethod
-    def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
-        """Draw an episode, given poses (4, 4) of tool and body in the scene."""
+    def starts(self, u: Array, tool: Array, body: Array) -> Starts:
+        """Starts of n episodes from uniform random numbers ``u`` (n, ``draws``) in [0, 1), and poses (4, 4) in the scene."""
 
     @abstractmethod
     def evaluate(self, state: TaskState) -> TaskResult:
         """Reward and end of a step."""
 
     @staticmethod
-    def effort(state: TaskState) -> dict[str, np.ndarray]:
+    def effort(state: TaskState) -> dict[str, Array]:
         """Terms of every task: −1e-4 |a − a₋₁|² and −1e-4 |q̇|² (Isaac Lab's lift task, its weights at the start)."""
         return {
-            "action_rate": -1e-4 * np.square(state.action - state.last_action).sum(axis=1),
-            "joint_speed": -1e-4 * np.square(state.joint_speed).sum(axis=1),
+            "action_rate": -1e-4 * squared(state.action - state.last_action),
+            "joint_speed": -1e-4 * squared(state.joint_speed),
         }
 
 
-def distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def distances(a: Array, b: Array) -> Array:
     """Distances (B,) of points (B, d)."""
-    apart = a - b
-    return np.sqrt(np.vecdot(apart, apart))
+    return array_namespace(a).sqrt(squared(a - b))
 
 
-def near(distance: np.ndarray, width: float) -> np.ndarray:
+def squared(vectors: Array) -> Array:
+    """Squared lengths (B,) of vectors (B, d)."""
+    return array_namespace(vectors).vecdot(vectors, vectors)
+
+
+def near(distance: Array, width: float) -> Array:
     """1 − tanh(d / width): 1 at no distance, 0 far away."""
-    return 1.0 - np.tanh(distance / width)
+    return 1.0 - array_namespace(distance).tanh(distance / width)
+
+
+def shifted(points: Array, by: Sequence[float]) -> Array:
+    """Points (…, d) moved by a vector (d,)."""
+    return array_namespace(points).stack([points[..., k] + value for k, value in enumerate(by)], axis=-1)
+
+
+def between(u: Array, low: float, high: float) -> Array:
+    """Numbers spread evenly over an interval, from those in [0, 1)."""
+    return low + (high - low) * u
+
+
+def around(point: Array, angle: Array, distance: Array) -> Array:
+    """Points (n, 3) at a distance from points (n, 3), in the horizontal direction of an angle [rad], each (n,)."""
+    xp = array_namespace(point)
+    return xp.stack([point[:, 0] + distance * xp.cos(angle), point[:, 1] + distance * xp.sin(angle), point[:, 2]], axis=1)
+
+
+def moved(point: Array, x: Array, y: Array) -> Array:
+    """Points (n, 3): one point (3,) moved by x and y, each (n,)."""
+    xp = array_namespace(point)
+    return xp.stack([point[0] + x, point[1] + y, point[2] + xp.zeros_like(x)], axis=1)
+
+
+def turned(rotation: Array, axis_x: Array, axis_y: Array, axis_z: Array) -> Array:
+    """Rotations (n, 3, 3): one rotation (3, 3) turned by rotation vectors whose components are (n,) [rad], world axes."""
+    return rotations(array_namespace(axis_x).stack([axis_x, axis_y, axis_z], axis=1)) @ rotation
+
+
+def poses_at(body: Array, position: Array) -> Array:
+    """Poses (n, 4, 4) at positions (n, 3), turned as a pose (4, 4)."""
+    result = array_namespace(position).zeros_like(position)[:, :, None] + body[:3, :3]
+    return poses_of(result, position)
+
+
+def distance_to(points: Array, place: Sequence[float]) -> Array:
+    """Distances (B,) of points (B, d) from one place (d,)."""
+    return array_namespace(points).sqrt(squared(shifted(points, [-value for value in place])))

@@ -15,9 +15,12 @@ import torch
 import warp as wp
 
 from raytac.checks import check_whole
+from raytac.envs.action_targets import ToolTargets
 from raytac.envs.batch import task_settings
-from raytac.envs.task_rules import Task, TaskState
+from raytac.envs.task_observation import body_from_tool, state_and_goal
+from raytac.envs.task_rules import Starts, Task, TaskState
 from raytac.envs.warp_touch import WarpTouch
+from raytac.errors import InputError
 from raytac.observe import ObservationSettings
 from raytac.robots.arm_kernels import pose_errors
 from raytac.specs.task import TaskScene
@@ -59,6 +62,7 @@ class WarpBatch:
         size: of an action.
         steps: since the start of each episode, (B,), int64; writing to them ends episodes as much earlier.
         start_tool, start_body: poses (4, 4) of the tool and of the task's body in the scene.
+        body_observation: pose and velocity of the body (B, 15) as they are observed if ``body_seen``; for a critic they always are.
     """
 
     def __init__(
@@ -102,7 +106,10 @@ class WarpBatch:
         self._wrenches, self._active = wp.to_torch(world.contact.wrenches), wp.to_torch(world.engine.active)
         self._body_at = list(world.composed.bodies).index(task.body)
         self.start_tool, self.start_body = self._state["tool"][0].clone(), self._body_now()[0].clone()
-        self._control = ToolTargets(task.motion, self.start_tool, num_envs)
+        opening = world.composed.opening
+        self._control = ToolTargets(
+            task.motion, self._state["tool"], 0.0 if opening is None else float(world.composed.ctrl[opening])
+        )
         self.size = len(task.motion.axes)
         self._generator = torch.Generator(self.device)
         self._generator.manual_seed(seed)
@@ -111,10 +118,10 @@ class WarpBatch:
         self._goal, self._action = zeros(num_envs, 3), zeros(num_envs, self.size)
         self._tool, self._body = self._state["tool"].clone(), self._body_now().clone()
         self._speed, self._body_speed, self._turn = zeros(num_envs, 3), zeros(num_envs, 6), zeros(num_envs, 3)
-        self._errors = PoseErrors(num_envs, 2, device=world.engine.device)
         # What graphs read and write stays where it is.
         self._ended = torch.ones(num_envs, dtype=torch.bool, device=self.device)
         self._tool_target, self._tool_twist = wp.to_torch(world.tool_target), wp.to_torch(world.tool_twist)
+        self._tool_target.copy_(self._tool)
         self._opening = None if world.opening is None else wp.to_torch(world.opening)
         starts = self._draw()
         self._placed = {name: poses.clone() for name, poses in starts.bodies.items()}
@@ -159,7 +166,9 @@ class WarpBatch:
             self._aim(actions)
             self._step_graph()
             dt, tool, body = self.control_timestep, self._state["tool"], self._body_now()
-            moved, turned = self._errors(torch.stack([body, tool]), torch.stack([self._body, self.start_tool.expand_as(tool)]))
+            moved, turned = _errors(
+                torch.stack([body, tool]), torch.stack([self._body, self.start_tool.expand_as(tool)])
+            )
             self._speed, self._body_speed, self._turn = (tool[:, :3, 3] - self._tool[:, :3, 3]) / dt, moved / dt, turned[:, 3:]
             self._tool, self._body = tool.clone(), body.clone()
             last, self._action = self._action, actions
@@ -193,12 +202,12 @@ class WarpBatch:
 
     def _aim(self, actions: torch.Tensor) -> None:
         """Move the targets of the tools and of the openings."""
-        before = self._control.target.clone()
+        before = self._control.pose
         self._control.move(actions, self._state["tool"][:, :3, 3])
         self._tool_target.copy_(before)
-        twist = self._errors(self._control.target[None], before[None])[0]
-        self._tool_twist.copy_(twist / self.control_timestep)
+        self._tool_twist.copy_(_errors(self._control.pose[None], before[None])[0] / self.control_timestep)
         if self._opening is not None:
+            self._control.grip(actions)
             self._opening.copy_(self._control.gap[:, None])
 
     def _begin(self) -> None:
@@ -214,7 +223,7 @@ class WarpBatch:
         self._speed, self._body_speed, self._action = (
             torch.where(begun, 0.0, old) for old in (self._speed, self._body_speed, self._action)
         )
-        turn = self._errors(self._tool[None], self.start_tool.expand_as(tool)[None])[0, :, 3:]
+        turn = _errors(self._tool[None], self.start_tool.expand_as(tool)[None])[0, :, 3:]
         self._turn = torch.where(begun, turn, self._turn)
         self.steps.masked_fill_(ended, 0)
         self._control.begin(ended, tool)
@@ -226,8 +235,11 @@ class WarpBatch:
     def _observe(self) -> dict[str, torch.Tensor]:
         """Observations of all environments, float32 and images of 8 bit."""
         fingers = self._state["fingers"]
-        opening = fingers.sum(1, keepdim=True) if self._opening is not None else fingers
-        result = observation(...)
+        opening = fingers.sum(1, keepdim=True) if self._control.has_grip else fingers[:, :0]
+        result = state_and_goal(self._tool, self.start_tool, self._turn, self._speed, opening, self._action, self._goal)
+        self.body_observation = body_from_tool(self._tool, self._body, self._body_speed)
+        if self.body_seen:
+            result["body"] = self.body_observation
         if self.touch is not None:
             result |= self.touch.observe()
         return result
@@ -260,3 +272,11 @@ class WarpBatch:
             return
         with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self.device))):
             yield
+
+
+def _errors(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Displacements (n, B, 6) from poses b to a (n, B, 4, 4), world axes, as ``se3.pose_error``."""
+    result = torch.empty((*a.shape[:2], 6), dtype=a.dtype, device=a.device)
+    arrays = [wp.from_torch(one.contiguous().view(-1, *one.shape[2:])) for one in (a, b, result)]
+    wp.launch(pose_errors, dim=len(arrays[0]), inputs=arrays[:2], outputs=arrays[2:], device=arrays[0].device)
+    return result
