@@ -6,8 +6,9 @@
     python experiments/bench_rl.py --envs 4096 --modes none,fots,table32 --device cuda --out runs/bench_rl_warp
     python experiments/bench_rl.py --frames --envs 512 --device cuda --out runs/bench_rl_cuda
 
-Modes: ``none`` (no touch), ``fots`` (9 x 11 marker displacements), ``touch`` (these and the wrench), ``table32`` (32 x 32 images of the Taxim table), ``raytrace64``
-(64 x 64 ray-traced images), ``raytrace320`` (320 x 240 of these). The policy is the multilayer perceptron of stable-baselines3's PPO, 2 x 64, in NumPy, with random weights,
+Modes: ``none`` (no touch), ``fots`` (9 x 11 marker displacements), ``touch`` (these and the wrench), ``table32`` (32 x 32 images of the
+Taxim table), ``raytrace64`` (64 x 64 ray-traced images), ``raytrace320`` (320 x 240 of these). The policy is the multilayer perceptron
+of stable-baselines3's PPO, 2 x 64, in NumPy, with random weights,
 a tenth of whose first two actions is taken and whose third is replaced by what presses the pad onto the cube with about 1 N: a random
 policy would hardly touch it, and contact is what costs. Medians over steps; ``pressed`` says in how many environments the pad was touched.
 
@@ -16,7 +17,7 @@ processes of their own, the order changing from round to round. ``push.<mode>.sp
 of both figures, ``name`` being the commit, and ``.speedup_least`` and ``.speedup_most`` are the extremes. With ``ball`` among the modes
 ``experiments/ball_rolling.py`` with the rigid pad takes turns too: ``ball_rolling.rigid.speedup_vs_<name>``.
 
-With ``--device cuda`` worlds are those of MuJoCo Warp and all stays on the device, the same policy in PyTorch too; keys begin with ``gpu.``,
+With ``--device cuda`` worlds are those of MuJoCo Warp and all stays on the device, the policy in PyTorch too; keys begin with ``gpu.``
 and times are the mean over steps, since nothing waits in between.
 
 ``--frames`` leaves physics out: how many images of ``--size`` a second of ``--envs`` pads that are pressed, each differently? The gel's
@@ -89,7 +90,7 @@ class Args(CommonOptions):
     engine: str = "auto"
     """``mujoco``: worlds on the CPU, images on ``--device``; ``mujoco_warp``: all on ``--device``; ``auto``: the latter on CUDA."""
     launches: int | None = None
-    """Steps of MuJoCo Warp in a control step, as many as the scene's if not given; of more, worlds in which something is fast divide one."""
+    """Steps of MuJoCo Warp in a control step, as many as the scene's if not given. Of more a world divides one where something is fast."""
     against: Path | None = None
     """Checkout of another commit to take turns with."""
     rounds: int = 3

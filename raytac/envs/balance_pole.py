@@ -31,9 +31,7 @@ class BalancePole(Task):
         # The pole leans about an edge of its foot, which stays 0.1 mm above the pad.
         foot[:, 2] = foot[:, 2] + 1e-4 + 0.003 * xp.sin(tilt)
         rotation = rotations(xp.stack([tilt * xp.cos(angle), tilt * xp.sin(angle), 0.0 * tilt], axis=1))
-        return Starts(
-            moved(tool[:3, 3], 0.0 * tilt, 0.0 * tilt), {"pole": poses_of(rotation, foot + 0.15 * rotation[:, :, 2])}
-        )
+        return Starts(moved(tool[:3, 3], 0.0 * tilt, 0.0 * tilt), {"pole": poses_of(rotation, foot + 0.15 * rotation[:, :, 2])})
 
     def evaluate(self, state: TaskState) -> TaskResult:
         xp, axis = array_namespace(state.body), state.body[:, :3, 2]

@@ -288,9 +288,7 @@ class TaskBatch:
 
         ``state``: present state of the world.
         """
-        result = state_and_goal(
-            self._tool, self.start_tool, self._turn, self._speed, self._opening, self._action, self._goal
-        )
+        result = state_and_goal(self._tool, self.start_tool, self._turn, self._speed, self._opening, self._action, self._goal)
         if self.body_seen:
             result["body"] = body_from_tool(self._tool, self._body, self._body_speed)
         rows = None if which.all() else rounded_envs(np.flatnonzero(which).tolist(), self.num_envs)

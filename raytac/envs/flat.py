@@ -15,6 +15,7 @@ from raytac.envs.environments import TactileVectorEnv
 from raytac.envs.processes import serve
 from raytac.observe.settings import SCALES
 
+
 @dataclass(frozen=True)
 class FlatLayout:
     """Arrays of a ``FlatVector``."""

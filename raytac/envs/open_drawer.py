@@ -7,7 +7,20 @@ from typing import ClassVar
 from array_api_compat import array_namespace
 
 from raytac.envs.environments import TactileEnv, TactileVectorEnv
-from raytac.envs.task_rules import Array, Motion, Starts, Task, TaskResult, TaskState, between, distances, moved, near, poses_at, shifted
+from raytac.envs.task_rules import (
+    Array,
+    Motion,
+    Starts,
+    Task,
+    TaskResult,
+    TaskState,
+    between,
+    distances,
+    moved,
+    near,
+    poses_at,
+    shifted,
+)
 
 HANDLE = (-0.09, 0.0, 0.034)
 """Place at which a gripper holds the handle, drawer frame [m]."""

@@ -42,7 +42,10 @@ class PushCube(Task):
 
     def evaluate(self, state: TaskState) -> TaskResult:
         cube = state.body[:, :3, 3]
-        reach, distance = distances(state.tool[:, :3, 3], shifted(cube, (0.0, 0.0, 0.02))), distances(cube[:, :2], state.goal[:, :2])
+        reach, distance = (
+            distances(state.tool[:, :3, 3], shifted(cube, (0.0, 0.0, 0.02))),
+            distances(cube[:, :2], state.goal[:, :2]),
+        )
         force = -state.wrench["sensor"][:, 2]
         terms = {
             "reaching": near(reach, 0.1),

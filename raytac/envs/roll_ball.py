@@ -8,7 +8,20 @@ from typing import ClassVar
 from array_api_compat import array_namespace
 
 from raytac.envs.environments import TactileEnv, TactileVectorEnv
-from raytac.envs.task_rules import Array, Motion, Starts, Task, TaskResult, TaskState, around, between, distances, moved, near, poses_at
+from raytac.envs.task_rules import (
+    Array,
+    Motion,
+    Starts,
+    Task,
+    TaskResult,
+    TaskState,
+    around,
+    between,
+    distances,
+    moved,
+    near,
+    poses_at,
+)
 
 
 class RollBall(Task):

@@ -166,9 +166,7 @@ class WarpBatch:
             self._aim(actions)
             self._step_graph()
             dt, tool, body = self.control_timestep, self._state["tool"], self._body_now()
-            moved, turned = _errors(
-                torch.stack([body, tool]), torch.stack([self._body, self.start_tool.expand_as(tool)])
-            )
+            moved, turned = _errors(torch.stack([body, tool]), torch.stack([self._body, self.start_tool.expand_as(tool)]))
             self._speed, self._body_speed, self._turn = (tool[:, :3, 3] - self._tool[:, :3, 3]) / dt, moved / dt, turned[:, 3:]
             self._tool, self._body = tool.clone(), body.clone()
             last, self._action = self._action, actions
@@ -197,6 +195,8 @@ class WarpBatch:
     def check(self) -> None:
         """Wait for the device. Raises ``InputError`` if contacts were lost for want of memory."""
         self.world.check()
+        if self.touch is not None:
+            self.touch.check()
 
     # --- parts of a step -------------------------------------------------------------------------------------------------------
 
@@ -219,7 +219,9 @@ class WarpBatch:
         tool, body = self._state["tool"], self._body_now()
         begun = ended[:, None]
         self._goal = torch.where(begun, starts.goal, self._goal)
-        self._tool, self._body = (torch.where(begun[..., None], now, old) for now, old in ((tool, self._tool), (body, self._body)))
+        self._tool, self._body = (
+            torch.where(begun[..., None], now, old) for now, old in ((tool, self._tool), (body, self._body))
+        )
         self._speed, self._body_speed, self._action = (
             torch.where(begun, 0.0, old) for old in (self._speed, self._body_speed, self._action)
         )

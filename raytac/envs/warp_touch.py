@@ -52,6 +52,7 @@ class WarpTouch:
         self._names = [mounted.name for mounted in world.composed.sensors]
         count, device = world.engine.num_envs, world.engine.device
         self.pads: dict[str, PadTouch] = {}
+        self._markers: dict[str, torch.Tensor] = {}
         self._images: dict[str, DeviceImages] = {}
         if not settings.needs_frames:
             return
@@ -64,9 +65,11 @@ class WarpTouch:
                 sensor = observer.make_sensor(device="cuda" if device.is_cuda else "cpu", pitch=own)
                 grid = sensor.grid
                 self._images[mounted.name] = DeviceImages(observer, sensor)
-            self.pads[mounted.name] = PadTouch(
+            self.pads[mounted.name] = pad = PadTouch(
                 mounted.spec, grid, bodies, observer.markers, num_envs=count, device=str(device), pad=k
             )
+            if pad.fots is not None:
+                self._markers[mounted.name] = wp.to_torch(pad.fots.displacement)
 
     def launch(self) -> None:
         """Launch the surfaces and markers of the present poses."""
@@ -78,6 +81,11 @@ class WarpTouch:
         for pad in self.pads.values():
             pad.reset(mask)
 
+    def check(self) -> None:
+        """Wait for the device. Raises ``InputError`` if contacts were lost for want of memory."""
+        for pad in self.pads.values():
+            pad.check()
+
     def observe(self) -> dict[str, torch.Tensor]:
         """Observations (B, …) after ``launch``: ``<sensor>_<modality>``."""
         result, settings = {}, self._settings
@@ -87,7 +95,7 @@ class WarpTouch:
                     case "wrench":
                         values = (self._wrenches[:, k] / self._wrench_scale).float()
                     case "markers":
-                        values = wp.to_torch(self.pads[name].markers) / settings.scale("markers")
+                        values = self._markers[name] / settings.scale("markers")
                     case _:
                         values = self._rendered(name)
                 result[f"{name}_{modality}"] = values
