@@ -104,7 +104,8 @@ class WarpTouch:
     def _rendered(self, name: str) -> torch.Tensor:
         """Images (B, height, width, 3) of 8 bit; another library renders them, which must not begin before the heights are there."""
         pad = self.pads[name]
-        wp.synchronize_stream(wp.get_stream(pad.height.device))
+        if pad.height.device.is_cuda:
+            wp.synchronize_stream(wp.get_stream(pad.height.device))
         heights = wp.to_torch(pad.height).reshape(-1)
         contact = wp.to_torch(pad.contact).reshape(-1)
         return torch.from_dlpack(self._images[name].observe(heights, contact)["rgb"])
