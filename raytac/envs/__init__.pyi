@@ -25,6 +25,7 @@ from .roll_ball import RollBall as RollBall
 from .roll_ball import RollBallEnv as RollBallEnv
 from .roll_ball import RollBallVectorEnv as RollBallVectorEnv
 from .rsl import RslVecEnv as RslVecEnv
+from .rsl import RslWarpEnv as RslWarpEnv
 from .sb3 import ProcessVecEnv as ProcessVecEnv
 from .sb3 import TactileVecEnv as TactileVecEnv
 from .scripted import SCRIPTED as SCRIPTED
@@ -33,3 +34,5 @@ from .task_rules import Starts as Starts
 from .task_rules import Task as Task
 from .task_rules import TaskResult as TaskResult
 from .task_rules import TaskState as TaskState
+from .warp_batch import WarpBatch as WarpBatch
+from .warp_batch import WarpStep as WarpStep

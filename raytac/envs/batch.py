@@ -96,7 +96,7 @@ class TaskBatch:
         check_known("action", action, ACTIONS)
         steps = task.max_episode_steps if max_episode_steps is None else max_episode_steps
         self.task, self.num_envs, self.max_episode_steps = task, num_envs, check_whole("max_episode_steps", steps)
-        settings = _settings(task.tactile if isinstance(tactile, str) and tactile == "task" else tactile)
+        settings = task_settings(task.tactile if isinstance(tactile, str) and tactile == "task" else tactile)
         loaded = scene if isinstance(scene, TaskScene) else load_task(task.scene if scene is None else scene)
         self.randomization = Randomization() if randomization is None else randomization
         # Without touch the probe gives the force alone, so that the sensor needs no markers.
@@ -113,7 +113,7 @@ class TaskBatch:
         options: dict[str, Any] = {"outputs": (), "num_envs": num_envs, "seed": seed}
         if settings is not None:
             options = probe.sensor_options()
-        options["pitch"] = _pitch(probe) if pitch is None else pitch
+        options["pitch"] = task_pitch(probe) if pitch is None else pitch
         self.world = TactileWorld(loaded, physics=config, device=device, **options)
         self._variations = VariationSampler(
             loaded, self.world.sensor_names, self.randomization, rigid=rigid, num_envs=num_envs, seed=seed
@@ -315,14 +315,14 @@ def _sensor_seed(seed: int, sensor: int) -> int:
     return seed + (sensor << 64)
 
 
-def _pitch(observer: TactileObserver) -> float:
+def task_pitch(observer: TactileObserver) -> float:
     """Pitch [m] as fine as the images, if there are any, between the coarsest allowed one and ``_PITCH``."""
     if "rgb" not in observer.settings.modalities:
         return _PITCH
     return max(COARSEST_PITCH, min(_PITCH, *observer.sensor.camera.pitch_at(observer.layout.rendered)))
 
 
-def _settings(tactile: ObservationSettings | Sequence[str] | str | None) -> ObservationSettings | None:
+def task_settings(tactile: ObservationSettings | Sequence[str] | str | None) -> ObservationSettings | None:
     if tactile is None or isinstance(tactile, ObservationSettings):
         return tactile
     return ObservationSettings((tactile,) if isinstance(tactile, str) else tuple(tactile))

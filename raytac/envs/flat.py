@@ -13,9 +13,7 @@ import numpy as np
 from raytac.checks import check_whole
 from raytac.envs.environments import TactileVectorEnv
 from raytac.envs.processes import serve
-
-_FORCE, _TORQUE = 10.0, 0.1
-"""Scales of the wrench that the critic is given [N, N m]: those of the observation ``wrench``."""
+from raytac.observe.settings import SCALES
 
 
 @dataclass(frozen=True)
@@ -126,8 +124,7 @@ class FlatVector:
         self._past[begun] = now[begun, None]
         actor = self._past.reshape(count, -1)
         wrench = self.env.batch.world.state().wrench
-        scale = np.array([_FORCE] * 3 + [_TORQUE] * 3)
-        felt = [np.nan_to_num(wrench[name] / scale) for name in self._sensors]
+        felt = [np.nan_to_num(wrench[name] / SCALES["wrench"]) for name in self._sensors]
         self.buffers["actor"][:] = actor
         self.buffers["critic"][:] = np.concatenate([actor, observation["body"], *felt], axis=1)
 

@@ -253,6 +253,17 @@ class MujocoWarp:
             self.read_rows()
             self._contact.end()
 
+    def finish(self) -> None:
+        """Poses of the present positions, in the world and in the pads' frames, without the host.
+
+        Environments in which a body has gone through a pad are no longer active.
+        """
+        self.update_poses()
+        self._contact.choose_active(self.active)
+        self.read_frames()
+        self._contact.move()
+        self._launch(kernels.end_worlds, self.num_envs, [self._contact.steps, self._done, self.active])
+
     def update_poses(self) -> None:
         """As of ``Engine``."""
         with wp.ScopedDevice(self.device):

@@ -74,7 +74,7 @@ def test_a_world_holds_its_start_and_returns_to_it() -> None:
     qpos = world.engine.data.qpos.numpy()
     np.testing.assert_array_equal(qpos[0], before)
     np.testing.assert_array_equal(qpos[1], start.astype(np.float32))
-    np.testing.assert_array_equal(world.target.numpy(), np.tile(start[arm.qpos], (2, 1)))
+    np.testing.assert_array_equal(world.target.numpy(), np.tile(start[arm.qpos].astype(np.float32), (2, 1)))
     np.testing.assert_array_equal(world.engine.data.time.numpy() > 0.0, [True, False])
 
 
