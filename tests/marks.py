@@ -45,6 +45,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "view/test_view_command.py",
     ),
     "solver": (
+        "envs/test_warp_batch.py",
         "ipc",
         "markers/test_other_models.py",
         "physics/rigid/test_pad_search.py",

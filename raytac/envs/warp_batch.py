@@ -18,11 +18,12 @@ from raytac.checks import check_whole
 from raytac.envs.action_targets import ToolTargets
 from raytac.envs.batch import task_settings
 from raytac.envs.task_observation import body_from_tool, state_and_goal
+from raytac.envs.task_outcome import task_outcome
 from raytac.envs.task_rules import Starts, Task, TaskState
 from raytac.envs.warp_touch import WarpTouch
 from raytac.errors import InputError
 from raytac.observe import ObservationSettings
-from raytac.robots.arm_kernels import pose_errors
+from raytac.robots.pose_errors import PoseErrors
 from raytac.specs.task import TaskScene
 from raytac.specs.task_file import load_task
 from raytac.world.warp_world import WarpWorld
@@ -113,6 +114,7 @@ class WarpBatch:
         self.size = len(task.motion.axes)
         self._generator = torch.Generator(self.device)
         self._generator.manual_seed(seed)
+        self._errors = PoseErrors(num_envs, 2, device=str(world.engine.device))
         zeros = partial(torch.zeros, dtype=torch.float64, device=self.device)
         self.steps = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         self._goal, self._action = zeros(num_envs, 3), zeros(num_envs, self.size)
@@ -166,7 +168,7 @@ class WarpBatch:
             self._aim(actions)
             self._step_graph()
             dt, tool, body = self.control_timestep, self._state["tool"], self._body_now()
-            moved, turned = _errors(torch.stack([body, tool]), torch.stack([self._body, self.start_tool.expand_as(tool)]))
+            moved, turned = self._errors((body, self._body), (tool, self.start_tool))
             self._speed, self._body_speed, self._turn = (tool[:, :3, 3] - self._tool[:, :3, 3]) / dt, moved / dt, turned[:, 3:]
             self._tool, self._body = tool.clone(), body.clone()
             last, self._action = self._action, actions
@@ -182,15 +184,11 @@ class WarpBatch:
                 action=actions,
                 last_action=last,
             )
-            result, failed = self.task.evaluate(state), ~self._active
-            terms = {name: torch.where(failed, 0.0, term) for name, term in result.terms.items()}
-            reward = torch.stack([term.expand(self.num_envs) for term in terms.values()]).sum(0)
-            terminated = result.terminated & ~failed
-            truncated = (failed | (self.steps >= self.max_episode_steps)) & ~terminated
-            success = result.success & ~failed
-            torch.logical_or(terminated, truncated, out=self._ended)
+            failed = ~self._active
+            end = task_outcome(self.task, state, self.steps, self.max_episode_steps, failed)
+            torch.logical_or(end.terminated, end.truncated, out=self._ended)
             self._begin()
-            return WarpStep(self._observe(), reward, terminated, truncated, terms, success, failed)
+            return WarpStep(self._observe(), end.reward, end.terminated, end.truncated, end.terms, end.success, failed)
 
     def check(self) -> None:
         """Wait for the device. Raises ``InputError`` if contacts were lost for want of memory."""
@@ -205,7 +203,7 @@ class WarpBatch:
         before = self._control.pose
         self._control.move(actions, self._state["tool"][:, :3, 3])
         self._tool_target.copy_(before)
-        self._tool_twist.copy_(_errors(self._control.pose[None], before[None])[0] / self.control_timestep)
+        self._tool_twist.copy_(self._errors((self._control.pose, before))[0] / self.control_timestep)
         if self._opening is not None:
             self._control.grip(actions)
             self._opening.copy_(self._control.gap[:, None])
@@ -225,7 +223,7 @@ class WarpBatch:
         self._speed, self._body_speed, self._action = (
             torch.where(begun, 0.0, old) for old in (self._speed, self._body_speed, self._action)
         )
-        turn = _errors(self._tool[None], self.start_tool.expand_as(tool)[None])[0, :, 3:]
+        turn = self._errors((self._tool, self.start_tool))[0, :, 3:]
         self._turn = torch.where(begun, turn, self._turn)
         self.steps.masked_fill_(ended, 0)
         self._control.begin(ended, tool)
@@ -274,11 +272,3 @@ class WarpBatch:
             return
         with wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(self.device))):
             yield
-
-
-def _errors(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Displacements (n, B, 6) from poses b to a (n, B, 4, 4), world axes, as ``se3.pose_error``."""
-    result = torch.empty((*a.shape[:2], 6), dtype=a.dtype, device=a.device)
-    arrays = [wp.from_torch(one.contiguous().view(-1, *one.shape[2:])) for one in (a, b, result)]
-    wp.launch(pose_errors, dim=len(arrays[0]), inputs=arrays[:2], outputs=arrays[2:], device=arrays[0].device)
-    return result
