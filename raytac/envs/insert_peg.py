@@ -60,7 +60,7 @@ class InsertPeg(Task):
         aside, height = distances(tip[:, :2], constant(SOCKET, tip)), tip[:, 2]
         inside = (aside < 2e-3) & (height < RIM)
         depth = xp.where(inside, 1.0 - (height / RIM).clip(0.0, 1.0), 0.0)
-        carried = inside | (height > 5e-3)
+        carried = inside | ((height > 5e-3) & (state.body[:, 2, 2] > 0.8))
         above = distances(tip, constant((*SOCKET, RIM + 4e-3), tip))
         terms = {
             "reaching": near(distances(state.tool[:, :3, 3], grip), 0.05),
@@ -96,7 +96,8 @@ class InsertPegEnv(TactileEnv):
     - `left_markers`, `right_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` selects others (docs/rl.md).
 
     Reward: sum of the terms in `info["reward_terms"]`, all ours; t the middle of the peg's lower end, g the place on its axis 11 mm above
-    its middle, s the socket's axis. Inside: t is below the rim and within 2 mm of s. Carried: t is over 5 mm high, or inside.
+    its middle, s the socket's axis. Inside: t is below the rim and within 2 mm of s. Carried: t is over 5 mm high and
+    the peg stands within 37° of upright, or inside.
 
     | term | value |
     | --- | --- |

@@ -69,6 +69,7 @@ class RslVecEnv(VecEnv):
             self._vector = FlatVector(kind, num_envs, seed=seed, **options)
             self.layout, self._arrays = self._vector.layout, self._vector.buffers
         self.num_actions, self.max_episode_length = self.layout.fields["action"][0], self.layout.max_episode_steps
+        self.control_timestep = self.layout.control_timestep
         self.cfg = {"kind": kind.__name__, **{name: str(value) for name, value in options.items()}}
 
     @property
@@ -174,6 +175,7 @@ class RslWarpEnv(VecEnv):
         self._history, self._past = check_whole("history", history), torch.zeros(0)
         self.num_actions, self.max_episode_length = self.batch.size, self.batch.max_episode_steps
         self.control_timestep = self.batch.control_timestep
+        self._scale = torch.tensor(SCALES["wrench"], dtype=torch.float64, device=self.device)
         self._observed = TensorDict({}, batch_size=[num_envs])
         self.cfg = {"kind": kind.__name__, **{name: str(value) for name, value in options.items()}}
 
@@ -222,7 +224,6 @@ class RslWarpEnv(VecEnv):
         self._past = torch.cat([now[:, None], self._past[:, :-1]], dim=1)
         self._past = torch.where(begun[:, None, None], now[:, None], self._past)
         actor = self._past.reshape(self.num_envs, -1)
-        scale = torch.tensor(SCALES["wrench"], device=self.device)
-        felt = [(wrench / scale).float() for wrench in self.batch.wrench.values()]
+        felt = [(wrench / self._scale).float() for wrench in self.batch.wrench.values()]
         critic = torch.cat([actor, self.batch.body_observation, *felt], dim=1)
         self._observed = TensorDict({"actor": actor, "critic": critic}, batch_size=[self.num_envs])

@@ -16,6 +16,7 @@ from raytac.robots.arm_kernels import Springs, joint_springs, servo_step
 from raytac.robots.ik import PoseServo
 from raytac.robots.panda import MAX_VELOCITY
 from raytac.robots.states import body_pose, numbers, site_pose
+from raytac.se3 import rigid_poses
 from raytac.specs.task import TaskScene
 from raytac.specs.task_file import load_task
 from raytac.world.compose import compose
@@ -25,7 +26,7 @@ from raytac.world.gel_pairs import GelPairs
 from raytac.world.pad_contact import PadIndices, gel_contact
 from raytac.world.start_kernels import aim_at_positions, place_body, set_columns
 
-_SPRINGS = ("time", "joints", "speed", "bias", "mass")
+_SPRINGS = ("joints", "speed", "bias", "mass")
 
 
 class WarpWorld:
@@ -40,10 +41,6 @@ class WarpWorld:
             (B, pads, bodies + pads) are the poses of everything in the pads' frames after it.
         engine: MuJoCo Warp's states; ``engine.active`` (B,) are the environments that have not broken down.
         models: of the environments; ``vary`` gives them others, which ``check`` uploads.
-        target, target_speed: of the arm's joints (B, n), float64, on the device; at the start where the joints are, at rest.
-        tool_target, tool_twist: pose (B, 4, 4) that the tool is to have at the start of a control step and its velocity in it (B, 6)
-            [m/s, rad/s], world axes, float64; ``aim`` turns them into the joints' targets.
-        opening: commanded gap between two pads (B, 1) [m], float64; None without a gripper.
         state: Warp arrays (B, …), float64, after the last step or reset: ``time``, ``joints``, ``speed``, ``tool`` (4, 4), ``fingers``,
             ``pads`` (pads, 4, 4) and ``bodies`` (bodies, 4, 4), in the order of ``composed``.
     """
@@ -101,21 +98,46 @@ class WarpWorld:
             springs.target, springs.target_speed = self._servo.step, self._servo.velocity
             springs.torque = wp.zeros((num_envs, len(arm)), dtype=wp.float64)
             springs.start = wp.zeros(num_envs, dtype=wp.float64)
+            springs.time = self.engine.elapsed
             self._motors, self._joints = (wp.array(index, dtype=wp.int32) for index in (arm.motors, arm.qpos))
             self._all = wp.full(num_envs, value=True, dtype=wp.bool)
             self._start = wp.array(np.repeat(composed.start[None], num_envs, axis=0), dtype=wp.float32)
             self._placed = wp.clone(self._start)
             self._ctrl = wp.array(np.repeat(composed.ctrl[None], num_envs, axis=0), dtype=wp.float32)
-            self.opening = None
+            self._opening = None
             if composed.opening is not None:
                 self._gap = wp.array(composed.ctrl[[composed.opening]], dtype=wp.float64)
                 self._gripper = wp.array([composed.opening], dtype=wp.int32)
-                self.opening = wp.zeros((num_envs, 1), dtype=wp.float64)
+                self._opening = wp.zeros((num_envs, 1), dtype=wp.float64)
         springs.stiffness, springs.damping = frequency**2, 2.0 * frequency
-        self._springs, self.target, self.target_speed = springs, springs.target, springs.target_speed
-        self.tool_target, self.tool_twist = self._servo.target, self._servo.twist
+        self._springs = springs
         self._graph: Callable[[], None] | None = None
         self.reset()
+
+    @property
+    def target(self) -> wp.array:
+        """Targets of the arm's joints (B, n), float64, to be written in place; at the start where the joints are."""
+        return self._springs.target
+
+    @property
+    def target_speed(self) -> wp.array:
+        """Speeds of the joints' targets in a control step (B, n), float64, to be written in place; 0 at the start."""
+        return self._springs.target_speed
+
+    @property
+    def tool_target(self) -> wp.array:
+        """Poses (B, 4, 4) that the tools are to have at the start of a control step, float64, to be written in place; for ``aim``."""
+        return self._servo.target
+
+    @property
+    def tool_twist(self) -> wp.array:
+        """Their velocities in the step (B, 6) [m/s, rad/s], world axes, float64, to be written in place; for ``aim``."""
+        return self._servo.twist
+
+    @property
+    def opening(self) -> wp.array | None:
+        """Commanded gap between two pads (B, 1) [m], float64, to be written in place; None without a gripper."""
+        return self._opening
 
     def reset(
         self,
@@ -126,7 +148,8 @@ class WarpWorld:
     ) -> None:
         """Put environments to positions, or to the scene's start, with the arm's targets there.
 
-        With Warp arrays on the device it launches kernels only.
+        With Warp arrays on the device it launches kernels only. Where a body starts beyond a gel's bonded face, the environment is not
+        active.
 
         Args:
             qpos: positions (B, nq); None is the scene's start.
@@ -134,13 +157,13 @@ class WarpWorld:
             bodies: other starts of free bodies: name to ``world_from_body`` (B, 4, 4), float64.
 
         Raises:
-            InputError: arrays of another shape, or a body that is not free.
+            InputError: arrays of another shape, numbers of the host that are not finite, or a body that is not free.
         """
         composed, count = self.composed, self.engine.num_envs
         shape = count, composed.model.nq
         positions, chosen = self._placed, self._all
         if qpos is not None and not isinstance(qpos, wp.array):
-            qpos = self._upload(check_numbers("qpos", qpos, shape), wp.float32)
+            qpos = self._upload(check_numbers("qpos", qpos, shape, finite=True), wp.float32)
         wp.copy(positions, self._start if qpos is None else qpos)
         if isinstance(envs, wp.array):
             chosen = envs
@@ -154,7 +177,7 @@ class WarpWorld:
             if name not in free:
                 raise InputError("bodies", value=name, rule="must be the name of a free body", choices=free)
             if not isinstance(poses, wp.array):
-                poses = self._upload(check_numbers(f"bodies[{name!r}]", poses, (count, 4, 4)), wp.float64)
+                poses = self._upload(rigid_poses(f"bodies[{name!r}]", poses, count), wp.float64)
             self._launch(place_body, count, [poses, composed.bodies[name].qpos, positions])
         self.engine.reset(chosen, positions, self._ctrl)
         self.contact.clear_active(chosen)
@@ -177,8 +200,6 @@ class WarpWorld:
 
     def launch(self) -> None:
         """Launch a control step, as ``step`` records it: for a graph that does more."""
-        self._reader.read()
-        wp.copy(self._springs.start, self.state["time"])
         self.engine.advance(self.drive, scene_steps=self._steps, launches=self._launches)
         self.engine.finish()
         self._reader.read()
@@ -196,8 +217,8 @@ class WarpWorld:
 
         Raises ``InputError`` if contacts were lost for want of memory.
         """
-        self.engine.prepare()
         self.contact.vary()
+        self.engine.prepare()
 
     def _upload(self, values: np.ndarray, dtype: Any) -> wp.array:
         return wp.array(values, dtype=dtype, device=self.engine.device)

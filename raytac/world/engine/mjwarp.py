@@ -47,6 +47,7 @@ class MujocoWarp:
         divides, device: as of ``Engine``.
         num_envs: B.
         timestep: of the scene's steps [s].
+        elapsed: time since ``advance`` began [s], (B,), which does not lose digits as MuJoCo Warp's clock does.
         active: environments that are stepped (B,), bool; those that break down are no longer.
         model, data: MuJoCo Warp's.
         peaks: most contacts of all environments at once, most pairs of MuJoCo's collision, most rows of one environment, and flags of
@@ -73,7 +74,8 @@ class MujocoWarp:
             models: of the environments; a variation may replace one.
             timestep: of the scene's steps [s], which divide into shorter ones; None is the models'.
             contacts, rows: memory for contacts and constraint rows, an environment each; None is a guess. All environments share the
-                memory for contacts. If it is too small, ``prepare`` and ``check_overflow`` raise an error.
+                memory for contacts. Where it is too small, environments are no longer active, and ``prepare`` and ``check_overflow``
+                raise an error.
 
         Raises:
             BackendError: MuJoCo Warp is not installed.
@@ -106,6 +108,7 @@ class MujocoWarp:
             shape = num_envs, *slots
             self._own: Any = kernels.Own()
             self.active, self._done = wp.full(num_envs, value=True, dtype=wp.bool), wp.zeros(num_envs, dtype=wp.int32)
+            self.elapsed = wp.zeros(num_envs, dtype=wp.float64)
             self._own.first, self._own.sliding = wp.zeros(1, dtype=wp.int32), wp.zeros(num_envs, dtype=wp.int32)
             self._own.contact, self._own.scale = wp.full(shape, -1, dtype=wp.int32), wp.zeros(shape, dtype=wp.float64)
             self._saved: Any = kernels.Saved()
@@ -114,6 +117,7 @@ class MujocoWarp:
             self._saved.warmstart = wp.clone(self.data.qacc_warmstart)
             self._mass, self._damped_mass = wp.empty_like(self.data.M), wp.empty_like(self.data.M)
             self.peaks = wp.zeros(4, dtype=wp.int32)
+            self._losses = sum(int(flag) for flag in mjw.OverflowType if flag.name in _LOST)
             bodies = np.concatenate([pads.carriers, pads.bodies])
             last = np.array([_last_dof(model, body) for body in bodies.tolist()])
             self._sites, self._bodies, self._last = (_array(values) for values in (pads.sites, bodies, last))
@@ -224,7 +228,7 @@ class MujocoWarp:
             if self._damped:
                 wp.copy(self.data.M, self._mass)
             self._mjw.implicit(self.model, self.data)
-        self._launch(kernels.end_states, self.num_envs, [self._worlds, self._saved, steps, self.peaks])
+        self._launch(kernels.end_states, self.num_envs, [self._worlds, self._saved, steps, self._losses, self.peaks])
         self._launch(kernels.end_worlds, self.num_envs, [steps, self._done, self.active])
 
     def read_rows(self) -> None:
@@ -241,7 +245,9 @@ class MujocoWarp:
         count = scene_steps if launches is None else launches
         if count < scene_steps:
             raise InputError("launches", value=launches, rule=f"must be {scene_steps} or more, one for each of the scene's steps")
+        self._done.zero_()
         for k in range(count):
+            self._launch(kernels.read_elapsed, self.num_envs, [self._done, self.timestep / self._contact.ticks, self.elapsed])
             self.begin_step()
             drive()
             self.free_acceleration()
