@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 from array_api_compat import array_namespace
 
-from raytac.envs.task_rules import Array, Motion
+from raytac.envs.task_rules import Array, Motion, constant
 from raytac.se3 import rotations
 
 
@@ -31,9 +33,15 @@ class ToolTargets:
         self.pose, self.turn = xp.asarray(tool, copy=True), xp.zeros_like(tool[:, :3, 3])
         self.gap = xp.full_like(tool[:, 0, 3], opening)
         self._first = self.pose[0, :3, :3]
-        axes = list(enumerate(motion.axes))
-        self._shifts = [("xyz".index(axis), k) for k, axis in axes if axis in ("x", "y", "z")]
-        self._turns = [("xyz".index(axis[1]), k) for k, axis in axes if axis in ("rx", "ry", "rz")]
+        column = {axis: k for k, axis in enumerate(motion.axes)}
+        self._columns = [column.get(axis, 0) for axis in "xyz"]
+        # An axis that no action moves has no step, and nothing holds it back.
+        moved = [axis in column for axis in "xyz"]
+        self._step = constant([motion.step[k] if one else 0.0 for one, k in zip(moved, self._columns, strict=True)], tool)
+        self._leash = constant([motion.leash if one else math.inf for one in moved], tool)
+        self._low = constant([low if one else -math.inf for one, low in zip(moved, motion.low, strict=True)], tool)
+        self._high = constant([high if one else math.inf for one, high in zip(moved, motion.high, strict=True)], tool)
+        self._turns = [(k, column[axis]) for k, axis in enumerate(("rx", "ry", "rz")) if axis in column]
         self.has_grip = "grip" in motion.axes
 
     def begin(self, mask: Array, tool: Array) -> None:
@@ -47,9 +55,9 @@ class ToolTargets:
         """Move the poses by actions (B, k), k the number of the motion's axes, where the tools are at (B, 3) now."""
         motion, xp = self._motion, array_namespace(actions)
         pose = xp.asarray(self.pose, copy=True)
-        for axis, k in self._shifts:
-            place = _leashed(pose[:, axis, 3] + motion.step[k] * actions[:, k], tool[:, axis], motion.leash)
-            pose[:, axis, 3] = place.clip(motion.low[axis], motion.high[axis])
+        shift = self._step * xp.stack([actions[:, k] for k in self._columns], axis=1)
+        place = _leashed(pose[:, :3, 3] + shift, tool, self._leash)
+        pose[:, :3, 3] = xp.minimum(xp.maximum(place, self._low), self._high)
         if self._turns:
             turn = xp.asarray(self.turn, copy=True)
             for axis, k in self._turns:
@@ -83,7 +91,7 @@ def joint_targets(motion: Motion, actions: Array, target: Array, joints: Array, 
     return xp.minimum(xp.maximum(target, limits[:, 0]), limits[:, 1])
 
 
-def _leashed(target: Array, now: Array, leash: float) -> Array:
+def _leashed(target: Array, now: Array, leash: Array | float) -> Array:
     """Targets that lead what is now by at most the leash."""
     xp = array_namespace(target)
     return xp.minimum(xp.maximum(target, now - leash), now + leash)

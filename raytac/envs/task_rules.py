@@ -148,8 +148,10 @@ def near(distance: Array, width: float) -> Array:
 
 def constant(values: Sequence[float], like: Array) -> Array:
     """A vector of the type and on the device of another array, where it is made: nothing is copied from the host."""
-    xp = array_namespace(like)
-    return xp.stack([xp.full((), value, dtype=like.dtype, device=device(like)) for value in values])
+    result = array_namespace(like).empty((len(values),), dtype=like.dtype, device=device(like))
+    for k, value in enumerate(values):
+        result[k : k + 1] = value  # a slice is filled on the device, a single element would be copied there
+    return result
 
 
 def between(u: Array, low: float, high: float) -> Array:

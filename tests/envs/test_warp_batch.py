@@ -102,6 +102,7 @@ def test_an_episode_that_ends_begins_again_and_the_others_go_on() -> None:
         WarpBatch(RollBall(), num_envs=3, tactile=None, device="cpu").step(still)
 
 
+@pytest.mark.renderer  # markers
 def test_rsl_rl_trains_on_observations_of_the_same_sizes() -> None:
     """Markers, in four environments, for 30 steps of episodes of 12."""
     pytest.importorskip("rsl_rl.env", exc_type=ImportError)
