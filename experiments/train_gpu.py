@@ -163,7 +163,7 @@ class Training:
         self._start = time.perf_counter()
         self.device = "cuda" if args.device == "auto" and torch.cuda.is_available() else args.device.replace("auto", "cpu")
         self.settings = _settings(args, touch, seed)
-        saved = self._saved()  # before any process is started
+        saved = _checkpoint(folder, self.settings, self.device)  # before any process is started
         self.steps, self.iteration = (0, 0) if saved is None else (saved["steps"], saved["iteration"])
         tactile: Any = {"none": None, "task": "task"}.get(touch, tuple(touch.split("+")))
         kind: Any = getattr(raytac.envs, f"{args.task}VectorEnv")
@@ -294,22 +294,6 @@ class Training:
             torch.save({**progress, **values}, stream)
             write_atomic(self.folder / f"{name}.pt", stream.getvalue())
 
-    def _saved(self) -> dict[str, Any] | None:
-        path = self.folder / "checkpoint.pt"
-        if not path.exists():
-            return None
-        try:
-            saved = torch.load(path, map_location=self.device, weights_only=True)
-            settings, *_ = (saved[name] for name in ("settings", "steps", "iteration", "wall_s", "actor_state_dict"))
-        except Exception as error:
-            raise InputError("out", value=path, rule=f"must be a checkpoint of train_gpu ({error})") from error
-        if settings != self.settings:
-            other = {k: v for k, v in settings.items() if v != self.settings.get(k)}
-            raise InputError(
-                "out", value=self.folder, rule=f"holds a training of other settings, with {other}: name another folder"
-            )
-        return saved
-
     @property
     def wall_s(self) -> float:
         """Seconds from the start, those before a resume too: worlds, compilation, rollouts, updates and evaluations."""
@@ -325,6 +309,7 @@ class Training:
 def train(args: Args, touch: str, seed: int, folder: Path) -> None:
     """One training, up to its steps, its target or the minutes; then the last evaluation."""
     start, total = time.perf_counter(), STEPS[args.task] if args.steps is None else args.steps
+    _checkpoint(folder, _settings(args, touch, seed), "cpu")
     if _is_done(args, folder, total):
         print(f"{args.task} {touch} seed {seed}: done before, in {folder}", flush=True)
         return
@@ -400,6 +385,22 @@ def main(args: Args) -> dict[str, Metric]:
     if interrupted:
         sys.exit(130)
     return found
+
+
+def _checkpoint(folder: Path, settings: Mapping[str, Any], device: str) -> dict[str, Any] | None:
+    """The folder's checkpoint; None without. Raises ``InputError`` for one of other settings."""
+    path = folder / "checkpoint.pt"
+    if not path.exists():
+        return None
+    try:
+        saved = torch.load(path, map_location=device, weights_only=True)
+        kept, *_ = (saved[name] for name in ("settings", "steps", "iteration", "wall_s", "actor_state_dict"))
+    except Exception as error:
+        raise InputError("out", value=path, rule=f"must be a checkpoint of train_gpu ({error})") from error
+    if kept != settings:
+        other = {k: v for k, v in kept.items() if v != settings.get(k)}
+        raise InputError("out", value=folder, rule=f"holds a training of other settings, with {other}: name another folder")
+    return saved
 
 
 def _is_done(args: Args, folder: Path, total: int) -> bool:

@@ -20,6 +20,7 @@ PLACES: dict[str, tuple[str, ...]] = {
     "renderer": (
         "calibrate",
         "dataset/test_renderer.py",
+        "envs/test_rsl_warp.py",
         "io/test_code_digest.py",
         "markers/test_calibration.py",
         "markers/test_dots.py",
@@ -45,6 +46,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "view/test_view_command.py",
     ),
     "solver": (
+        "envs/test_rsl_warp.py",
         "envs/test_warp_batch.py",
         "ipc",
         "markers/test_other_models.py",

@@ -49,6 +49,7 @@ class WarpTouch:
         self._wrenches = wp.to_torch(world.contact.wrenches)
         scale = torch.tensor(settings.scale("wrench"), dtype=torch.float64, device=self._wrenches.device)
         self._wrench_scale = scale.expand(6)
+        self._marker_scale = float(settings.scale("markers"))  # type: ignore[arg-type]  # six numbers are of the wrench alone
         self._names = [mounted.name for mounted in world.composed.sensors]
         count, device = world.engine.num_envs, world.engine.device
         self.pads: dict[str, PadTouch] = {}
@@ -95,7 +96,7 @@ class WarpTouch:
                     case "wrench":
                         values = (self._wrenches[:, k] / self._wrench_scale).float()
                     case "markers":
-                        values = self._markers[name] / settings.scale("markers")
+                        values = self._markers[name] / self._marker_scale
                     case _:
                         values = self._rendered(name)
                 result[f"{name}_{modality}"] = values
@@ -104,8 +105,9 @@ class WarpTouch:
     def _rendered(self, name: str) -> torch.Tensor:
         """Images (B, height, width, 3) of 8 bit; another library renders them, which must not begin before the heights are there."""
         pad = self.pads[name]
-        if pad.height.device.is_cuda:
-            wp.synchronize_stream(wp.get_stream(pad.height.device))
+        device = self._world.engine.device
+        if device.is_cuda:
+            wp.synchronize_stream(wp.get_stream(device))
         heights = wp.to_torch(pad.height).reshape(-1)
         contact = wp.to_torch(pad.contact).reshape(-1)
         return torch.from_dlpack(self._images[name].observe(heights, contact)["rgb"])

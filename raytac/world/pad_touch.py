@@ -14,6 +14,7 @@ from raytac.physics.rigid.gel_contact import GelContact
 from raytac.physics.rigid.underside import Undersides
 from raytac.shapes.part import Part
 from raytac.specs.sensor import SensorSpec
+from raytac.world.start_kernels import copy_mask
 
 
 class PadTouch:
@@ -58,7 +59,7 @@ class PadTouch:
         """Launch the kernels for the poses of ``contact.motion``; ``active`` (B,), bool: environments that have not broken down."""
         under, poses = self._undersides, contact.motion.pose
         wp.copy(under.poses, poses[:, self._pad, : self._bodies])
-        wp.launch(mark, dim=len(active), inputs=[active, under.sound], device=under.device)
+        wp.launch(copy_mask, dim=len(active), inputs=[active, under.sound], device=under.device)
         under.launch()
         self._surround.launch(under.height, under.deepest, active)
         if self.fots is not None:
@@ -73,10 +74,3 @@ class PadTouch:
         """Wait for the device. Raises ``InputError`` if contacts were lost for want of memory."""
         if self.fots is not None:
             self.fots.check()
-
-
-@wp.kernel
-def mark(active: wp.array(dtype=wp.bool), sound: wp.array(dtype=wp.int32)):
-    """Copy a mask."""
-    i = wp.tid()
-    sound[i] = wp.where(active[i], 1, 0)

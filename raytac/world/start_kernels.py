@@ -1,4 +1,4 @@
-"""Kernels that put environments on the device to where an episode starts."""
+"""Kernels that put environments on the device to where an episode starts, and hand on masks."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -59,3 +59,10 @@ def set_columns(
     i, k = wp.tid()
     if chosen[i]:
         rows[i, k] = values[k]
+
+
+@wp.kernel
+def copy_mask(mask: wp.array(dtype=wp.bool), numbers: wp.array(dtype=wp.int32)):
+    """Copy a mask (B,) to numbers that are 0 or 1."""
+    i = wp.tid()
+    numbers[i] = wp.where(mask[i], 1, 0)

@@ -1,135 +1,178 @@
-"""Tasks on MuJoCo Warp: the same episodes as on C MuJoCo, and as environments of rsl_rl."""
+"""Tasks on MuJoCo Warp, all on one device: against ``TaskBatch`` on C MuJoCo, episodes that end, no copies to the host."""
 
 # pyright: reportMissingImports=false
-# (MuJoCo Warp, rsl_rl and PyTorch belong to extras, which the tests do without.)
+# (PyTorch belongs to the extra "rl", which the tests do without.)
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
-from raytac.envs import (
-    SCRIPTED,
-    BalancePole,
-    InsertPeg,
-    LiftCube,
-    OpenDrawer,
-    PushCube,
-    RollBall,
-    RollBallVectorEnv,
-    Task,
-    TaskBatch,
-)
-from raytac.errors import InputError
-
 pytest.importorskip("mujoco_warp")
 pytest.importorskip("torch")
+
 import torch
+import warp as wp
 
-from raytac.envs.warp_batch import WarpBatch
+from raytac.envs import SCRIPTED, BalancePole, LiftCube, OpenDrawer, PushCube, RollBall, Task, TaskBatch, WarpBatch
+from raytac.errors import InputError
+from raytac.observe import ObservationSettings
 
-SLOW = [
-    pytest.param(kind, steps, marks=pytest.mark.slow) for kind, steps in ((LiftCube, 150), (InsertPeg, 90), (OpenDrawer, 120))
-]
-
-
-class Drawn:
-    """Generator that gives numbers drawn before."""
-
-    def __init__(self, numbers: np.ndarray) -> None:
-        self._numbers = numbers
-
-    def random(self, count: int) -> np.ndarray:
-        return self._numbers[:count]
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 
-@pytest.mark.parametrize(("kind", "steps"), [(PushCube, 40), (RollBall, 30), (BalancePole, 30), *SLOW])
-def test_an_episode_is_that_of_c_mujoco(kind: type[Task], steps: int) -> None:
-    """In two environments, with the actions of a scripted policy on C MuJoCo: tool and body to 0.5 mm, contacts on the same steps, give or
-    take one, and forces of contacts that last to 3 %. (A peg that meets its socket's rim is not repeatable.)
-    """
-    ours = WarpBatch(kind(), num_envs=2, tactile=("wrench",), device="cpu", body_seen=True)
-    other = TaskBatch(kind(), num_envs=2, tactile=("wrench",), device="cpu", body_seen=True)
-    u = torch.rand(2, kind.draws, generator=torch.Generator().manual_seed(7), dtype=torch.float64).numpy()
-    seen, expected = ours.reset(7), other.reset([0, 1], [Drawn(row) for row in u])  # type: ignore[list-item]
-    assert list(seen) == list(other.arrays) and all(seen[name].dtype == torch.float32 for name in seen)
-    for name, array in expected.items():
-        np.testing.assert_allclose(seen[name].numpy(), array, atol=2e-5, err_msg=name)
-    wrenches = []
-    for k in range(steps):
-        actions = SCRIPTED[kind.__name__](other)
-        step, wanted = ours.step(torch.asarray(actions)), other.step(actions)
-        assert list(step.terms) == list(wanted.terms) and not step.failed.any() and not wanted.failed.any()
-        np.testing.assert_array_equal(step.terminated.numpy(), wanted.terminated)
-        assert not step.truncated.any() and step.reward.dtype == torch.float64
-        for name in ("goal", "body"):  # in units of 0.1 m
-            apart = np.abs(step.observation[name].numpy() - wanted.observation[name])[:, :3].max()
-            assert apart < 5e-3, (k, name, apart)
-        np.testing.assert_allclose(step.observation["state"][:, -ours.size :].numpy(), actions, atol=1e-6)
-        wrench = other.world.state().wrench
-        wrenches.append([np.concatenate([wrench[name], ours.wrench[name].numpy()], axis=1) for name in wrench])
-    ours.check()
-    both = np.array(wrenches)
-    forces, found = both[..., :3], both[..., 6:9]
-    touch, other_touch = (np.linalg.norm(one, axis=-1) > 0.05 for one in (found, forces))
-    for one, two in ((touch, other_touch), (other_touch, touch)):
-        near = two[1:-1] | two[:-2] | two[2:]
-        assert not (one[1:-1] & ~near).any()
-    # A step earlier or later at the first touch is another force in the steps after it.
-    settled = np.lib.stride_tricks.sliding_window_view(touch & other_touch, 6, axis=0).all(axis=-1)
-    assert settled.any(axis=0).all()
-    assert np.linalg.norm((found - forces)[5:][settled]) < 0.03 * np.linalg.norm(forces[5:][settled])
+class Both:
+    """The same episodes on both engines; actions are those of the scripted policy on C MuJoCo."""
+
+    def __init__(self, task: type[Task], device: str, *, tactile: tuple[str, ...] = ("wrench",), count: int = 2) -> None:
+        self.host = TaskBatch(task(), num_envs=count, tactile=tactile, max_episode_steps=10**6)
+        self.warp = WarpBatch(task(), num_envs=count, tactile=tactile, max_episode_steps=10**6, device=device, launches=4)
+        self.host.reset(range(count), [np.random.default_rng(k) for k in range(count)])
+        u = np.stack([np.random.default_rng(k).random(task.draws) for k in range(count)])
+        starts = self.warp.task.starts(torch.tensor(u, device=self.warp.device), self.warp.start_tool, self.warp.start_body)
+        self.warp._draw = lambda: starts  # type: ignore[method-assign]
+        self.warp.reset()
+        self.policy = SCRIPTED[task.__name__]
+
+    def play(self, steps: int) -> dict[str, np.ndarray]:
+        """Of every step: forces of both, and distances of bodies and tools."""
+        forces, apart, seen = [], [], []
+        for _ in range(steps):
+            actions = self.policy(self.host)
+            one, two = self.host.step(actions), self.warp.step(torch.tensor(actions, device=self.warp.device))
+            own = [wrench[:, :3] for wrench in self.host.world.state().wrench.values()]
+            other = [wrench[:, :3].cpu().numpy() for wrench in self.warp.wrench.values()]
+            forces.append((np.stack(own, axis=1), np.stack(other, axis=1)))
+            body = self.warp.world.state["bodies"].numpy()[:, self.warp._body_at]
+            tool = self.warp.world.state["tool"].numpy()
+            apart.append([np.abs(a - b)[:, :3, 3].max() for a, b in ((self.host.body, body), (self.host.tool, tool))])
+            seen.append(
+                [np.abs(one.observation[name] - two.observation[name].cpu().numpy()).max() for name in one.observation]
+                + [np.abs(one.reward - two.reward.cpu().numpy()).max()]
+            )
+        self.warp.check()
+        return {"force": np.array(forces), "apart": np.array(apart), "seen": np.array(seen)}
 
 
-def test_an_episode_that_ends_begins_again_and_the_others_go_on() -> None:
-    batch = WarpBatch(RollBall(), num_envs=3, tactile=None, device="cpu", max_episode_steps=6)
-    first = {name: array.clone() for name, array in batch.reset(3).items()}
-    batch.steps += torch.tensor([0, 3, 0])
-    still = torch.zeros(3, 3)
-    for k in range(6):
-        step = batch.step(still)
-        assert step.truncated.tolist() == [k == 5, k == 2, k == 5] and not step.terminated.any()
-        if k == 2:
-            np.testing.assert_array_equal(batch.steps.numpy(), [3, 0, 3])
-            np.testing.assert_array_equal(step.observation["state"][1].numpy(), 0.0)
-            assert not torch.equal(step.observation["goal"][1], first["goal"][1])
-            torch.testing.assert_close(step.observation["goal"][[0, 2]], first["goal"][[0, 2]], rtol=0, atol=1e-4)
-    again = batch.reset(3)
-    torch.testing.assert_close(again, first, rtol=0, atol=0)
+def contact_steps(force: np.ndarray) -> np.ndarray:
+    """True in the steps in which a pad is touched."""
+    return np.abs(force).sum(axis=-1) > 0.0
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_press_is_that_of_c_mujoco(device: str) -> None:
+    found = Both(PushCube, device, count=1).play(20)
+    own, other = found["force"][:, 0], found["force"][:, 1]
+    assert found["apart"].max() < 2e-5 and own[-1].any()
+    assert np.linalg.norm(other - own) < 0.01 * np.linalg.norm(own)
+    assert found["seen"].max() < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("task", [PushCube, RollBall, LiftCube, OpenDrawer])
+def test_200_steps_of_a_scripted_policy_agree(task: type[Task], device: str) -> None:
+    """Poses to 0.5 mm, forces to 3 % RMS, contact in the same steps ± 1."""
+    found = Both(task, device).play(200)
+    own, other = found["force"][:, 0], found["force"][:, 1]
+    assert found["apart"].max() < 0.5e-3
+    assert np.linalg.norm(other - own) < 0.03 * np.linalg.norm(own)
+    one, two = contact_steps(own), contact_steps(other)
+    for k in np.argwhere(one != two):
+        near = slice(max(k[0] - 1, 0), k[0] + 2)
+        assert (one[near, *k[1:]] != one[k[0], *k[1:]]).any() or (two[near, *k[1:]] != two[k[0], *k[1:]]).any(), k
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_pole_stands_as_on_c_mujoco(device: str) -> None:
+    """An unstable balance, whose differences grow: 60 steps."""
+    found = Both(BalancePole, device).play(60)
+    own, other = found["force"][:, 0], found["force"][:, 1]
+    assert found["apart"].max() < 0.5e-3 and np.linalg.norm(other - own) < 0.03 * np.linalg.norm(own)
+
+
+def test_markers_are_those_of_the_host() -> None:
+    both = Both(PushCube, "cpu", tactile=("markers", "wrench"), count=1)
+    seen = both.play(16)["seen"]
+    names = list(both.warp.reset())
+    assert names.index("sensor_markers") >= 0 and seen.max() < 0.02
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_episodes_that_end_begin_again_and_leave_the_others_to_the_bit(device: str) -> None:
+    one, other = (
+        WarpBatch(PushCube(), num_envs=3, tactile=("markers", "wrench"), device=device, seed=1, max_episode_steps=50)
+        for _ in range(2)
+    )
+    for batch in (one, other):
+        batch.reset(7)
+    other.steps[1] = 45  # its episode ends in the fifth step
+    rng = np.random.default_rng(0)
+    for step in range(8):
+        actions = torch.tensor(rng.uniform(-1.0, 1.0, (3, 3)), device=one.device)
+        a, b = one.step(actions), other.step(actions)
+        assert b.truncated.tolist() == [False, step == 4, False]
+        for name, values in a.observation.items():
+            assert torch.equal(values[[0, 2]], b.observation[name][[0, 2]]), name
+    assert other.steps.tolist() == [8, 3, 8] and not torch.equal(a.observation["state"][1], b.observation["state"][1])
+
+
+@contextmanager
+def no_copies(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """Names of the copies to the host, and of the waits, that are asked for inside."""
+    counted: list[str] = []
+
+    def count(owner: type, name: str) -> None:
+        kept = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda *a, **k: (counted.append(name), kept(*a, **k))[1])
+
+    with monkeypatch.context():
+        for name in ("numpy", "list"):
+            count(wp.array, name)
+        for name in ("cpu", "numpy", "item", "tolist", "__bool__", "__float__", "__int__", "nonzero"):
+            count(torch.Tensor, name)
+        for name in ("synchronize", "synchronize_device", "synchronize_stream"):
+            count(wp, name)
+        yield counted
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_step_copies_nothing_to_the_host(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    batch = WarpBatch(PushCube(), num_envs=2, tactile=("markers", "wrench"), device=device)
+    batch.reset()
+    actions = torch.zeros(2, 3, device=batch.device)
+    batch.step(actions)
+    if device == "cuda":
+        torch.cuda.set_sync_debug_mode("error")
+    try:
+        with no_copies(monkeypatch) as counted:
+            for _ in range(3):
+                batch.step(actions)
+            assert counted == []
+            batch.check()
+            assert "numpy" in counted  # the counter counts
+    finally:
+        if device == "cuda":
+            torch.cuda.set_sync_debug_mode("default")
+
+
+def test_what_is_not_on_the_device_is_refused() -> None:
+    for settings, name in (
+        (("height",), "modalities"),
+        (("rgb", "markers"), "modalities"),
+        (ObservationSettings(("wrench",), stack=2), "stack"),
+        (ObservationSettings(("markers",), markers="surface"), "markers"),
+    ):
+        with pytest.raises(InputError) as error:
+            WarpBatch(PushCube(), tactile=settings, device="cpu")
+        assert error.value.name == name
+    batch = WarpBatch(PushCube(), tactile=None, device="cpu")
+    with pytest.raises(InputError, match="reset"):
+        batch.step(torch.zeros(1, 3))
+    batch.reset()
     with pytest.raises(InputError, match="actions"):
         batch.step(torch.zeros(2, 3))
-    with pytest.raises(InputError, match="reset"):
-        WarpBatch(RollBall(), num_envs=3, tactile=None, device="cpu").step(still)
-
-
-@pytest.mark.renderer  # markers
-def test_rsl_rl_trains_on_observations_of_the_same_sizes() -> None:
-    """Markers, in four environments, for 30 steps of episodes of 12."""
-    pytest.importorskip("rsl_rl.env", exc_type=ImportError)
-    from raytac.envs.rsl import RslVecEnv, RslWarpEnv
-
-    options = {"num_envs": 4, "history": 2, "tactile": ("markers",), "max_episode_steps": 12}
-    env = RslWarpEnv(RollBallVectorEnv, device="cpu", reward_scale=0.5, **options)
-    sizes = {name: array.shape for name, array in RslVecEnv(RollBallVectorEnv, **options).reset(3).items()}
-    assert {name: array.shape for name, array in env.reset(3).items()} == sizes
-    actor = sizes["actor"][1]
-    actions = torch.tensor([[0.0, 0.0, -1.0]] * 3 + [[0.0, 0.0, 1.0]])
-    ends, marked = torch.zeros(4), torch.zeros(4)
-    for k in range(30):
-        seen, reward, done, extras = env.step(actions)
-        assert all(array.shape == sizes[name] and array.dtype == torch.float32 for name, array in seen.items())
-        assert all(torch.isfinite(array).all() for array in (seen["actor"], seen["critic"], reward))
-        logged = sum(float(value) for value in extras["log"].values())
-        assert logged == pytest.approx(2.0 * float(reward.mean()), rel=1e-6)
-        assert done.tolist() == [float(k % 12 == 11)] * 4 == extras["time_outs"].tolist()
-        half = seen["actor"].reshape(4, 2, actor // 2)
-        begun = bool(done[0])
-        assert torch.equal(half[:, 0], half[:, 1]) == begun, "of an episode that begins, the history holds the first observation"
-        markers = half[:, 0, -2 * 99 :].abs().amax(dim=1)
-        assert not begun or not markers.any()
-        ends, marked = ends + done, torch.maximum(marked, markers)
-        assert torch.equal(seen["critic"][:, :actor], seen["actor"])
-    assert ends.tolist() == [2.0] * 4 and (marked[:3] > 0.01).all() and marked[3] == 0.0
-    env.episode_length_buf = torch.full((4,), 11)
-    assert env.step(actions)[2].tolist() == [1.0] * 4 and env.episode_length_buf.tolist() == [0] * 4
-    env.close()
