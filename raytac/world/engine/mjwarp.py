@@ -25,7 +25,7 @@ from raytac.warp_runtime import start_warp
 from raytac.world.engine import mjwarp_kernels as kernels
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.implicit_damping import ImplicitDamping
-from raytac.world.pad_contact import PadIndices
+from raytac.world.pad_contact import PadIndices, last_dofs
 from raytac.world.world_state import LARGEST_SPEED
 
 _SLIDES = 2
@@ -93,7 +93,8 @@ class MujocoWarp:
         slots = len(pads.sites), len(pads.geoms)
         self._contacts = 24 + 2 * slots[0] * slots[1] + 4 * slots[1] if contacts is None else contacts
         self._rows = 4 * self._contacts if rows is None else rows
-        self._damped = ImplicitDamping(model).matters
+        damping = ImplicitDamping(model)
+        self._damped = damping.matters
         with wp.ScopedDevice(self.device):
             sizes = {name: num_envs for name in _VARIED if getattr(model, name).size}
             try:
@@ -119,8 +120,8 @@ class MujocoWarp:
             self.peaks = wp.zeros(4, dtype=wp.int32)
             self._losses = sum(int(flag) for flag in mjw.OverflowType if flag.name in _LOST)
             bodies = np.concatenate([pads.carriers, pads.bodies])
-            last = np.array([_last_dof(model, body) for body in bodies.tolist()])
-            self._sites, self._bodies, self._last = (_array(values) for values in (pads.sites, bodies, last))
+            self._sites, self._bodies, self._last = (_array(values) for values in (pads.sites, bodies, last_dofs(model, bodies)))
+            self._share = wp.array(damping.share, dtype=wp.float64)
             self._others, self._hard = _array(pads.geoms), _array(pads.hard)
             self._gels = _array(pads.geoms[len(pads.bodies) :])
         self._models = [models[0]] * num_envs
@@ -191,8 +192,8 @@ class MujocoWarp:
 
     def read_frames(self) -> None:
         """As of ``Engine``."""
-        shape = self.num_envs, len(self._bodies)
-        self._launch(kernels.read_frames, shape, [self._worlds, self._sites, self._bodies, self._last, self._contact.frames])
+        shape, frames = (self.num_envs, len(self._bodies)), (self._worlds, self._sites, self._bodies, self._last)
+        self._launch(kernels.read_frames, shape, [*frames, self._share, self._contact.frames])
 
     def put_contacts(self, *, own_step: bool = True) -> None:
         """As of ``Engine``, and make all constraints; a contact for which there is no memory is an error of ``prepare``."""
@@ -405,13 +406,6 @@ def _worlds(model: Any, data: Any) -> Any:
     for name in ("J", "D", "vel", "aref", "force"):
         setattr(result, name, getattr(data.efc, name))
     return result
-
-
-def _last_dof(model: mujoco.MjModel, body: int) -> int:
-    """Last degree of freedom that moves a body; −1 of one that stands still."""
-    while body and not model.body_dofnum[body]:
-        body = int(model.body_parentid[body])
-    return int(model.body_dofadr[body] + model.body_dofnum[body]) - 1 if body else -1
 
 
 def _array(values: np.ndarray) -> wp.array:

@@ -231,13 +231,15 @@ def read_frames(
     sites: wp.array(dtype=wp.int32),
     bodies: wp.array(dtype=wp.int32),
     last: wp.array(dtype=wp.int32),
+    share: wp.array(dtype=wp.float64),
     # outputs
     frames: Frames,
 ):
     """Frames of pads, at their sites, and of bodies, with their velocities and free accelerations.
 
-    ``bodies``: those that carry the pads first; ``last``: last degree of freedom that moves each, −1 of none. As in a constraint row, the
-    accelerations hold nothing of what velocities alone give.
+    ``bodies``: those that carry the pads first; ``last``: last degree of freedom that moves each, −1 of none; ``share``: of the
+    acceleration of each that comes, as damping is implicit (``ImplicitDamping``). As in a constraint row, the accelerations hold nothing of
+    what velocities alone give.
     """
     i, k = wp.tid()
     body = bodies[k]
@@ -259,7 +261,7 @@ def read_frames(
     swing, push = wp.vec3d(), wp.vec3d()
     dof = last[k]
     while dof >= 0:
-        smooth, axis = wp.float64(worlds.qacc_smooth[i, dof]), worlds.cdof[i, dof]
+        smooth, axis = share[dof] * wp.float64(worlds.qacc_smooth[i, dof]), worlds.cdof[i, dof]
         swing += smooth * double3(wp.spatial_top(axis))
         push += smooth * double3(wp.spatial_bottom(axis))
         dof = worlds.dof_parentid[dof]
