@@ -1,4 +1,4 @@
-"""``WarpTouch``: what the sensors of a ``WarpWorld`` observe, as tensors on its device."""
+"""``WarpTouch``: observations that the sensors of a ``WarpWorld`` make, as tensors on its device."""
 
 # pyright: reportMissingImports=false
 # (PyTorch belongs to the extra "rl", which the tests do without.)

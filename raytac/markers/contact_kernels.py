@@ -172,7 +172,7 @@ def detect(
     moments: wp.array2d(dtype=Moments),
     # outputs
     box: wp.array(dtype=wp.vec4i),
-    found: wp.array2d(dtype=Contact),
+    contacts: wp.array2d(dtype=Contact),
     most: wp.array(dtype=wp.int32),
 ):
     """Contacts of every environment, 8-connected, in the order of their first cells, without history.
@@ -181,7 +181,7 @@ def detect(
     those beyond the memory are left out.
     """
     env = wp.tid()
-    rows, columns, room = depth.shape[1], depth.shape[2], found.shape[1]
+    rows, columns, room = depth.shape[1], depth.shape[2], contacts.shape[1]
     c0, c1, r0, r1 = wp.int32(columns), wp.int32(0), wp.int32(rows), wp.int32(0)
     for row in range(rows):
         for column in range(columns):
@@ -201,7 +201,7 @@ def detect(
                             if parent[env, cell - columns + k - 1] >= 0:
                                 join(parent, env, cell, cell - columns + k - 1)
     for k in range(room):
-        found[env, k].active = 0
+        contacts[env, k].active = 0
         moments[env, k] = Moments()
     if c1 == 0:
         box[env] = wp.vec4i(0, 0, 0, 0)
@@ -234,7 +234,7 @@ def detect(
                 moments[env, number] = m
     wp.atomic_max(most, 0, count)
     for k in range(wp.min(count, room)):
-        found[env, k] = contact_of(moments[env, k], pad)
+        contacts[env, k] = contact_of(moments[env, k], pad)
 
 
 @wp.func
@@ -265,7 +265,7 @@ def follow(
     sound: wp.array(dtype=wp.bool),
     shear: Shear,
     pad: Pad,
-    found: wp.array2d(dtype=Contact),
+    contacts: wp.array2d(dtype=Contact),
     # state
     before: wp.array2d(dtype=Contact),
     pose_before: wp.array(dtype=wp.mat44d),
@@ -279,7 +279,7 @@ def follow(
     the object.
     """
     env = wp.tid()
-    bodies, room = depths.shape[1], found.shape[1]
+    bodies, room = depths.shape[1], contacts.shape[1]
     pressed, deepest = wp.int32(-1), wp.float64(0.0)
     for body in range(bodies):
         depth = depths[env, body] + _0
@@ -298,7 +298,7 @@ def follow(
         y = pose[1, 3] - d[1, 0] * old[0, 3] - d[1, 1] * old[1, 3] - d[1, 2] * old[2, 3]
         angle = wp.atan2(d[1, 0] - d[0, 1], d[0, 0] + d[1, 1])
     for k in range(room):
-        now = found[env, k]
+        now = contacts[env, k]
         if now.active == 1:
             nearest, chosen, least = wp.int32(-1), wp.vec2d(), wp.float64(1e30)
             for n in range(room):
@@ -318,11 +318,11 @@ def follow(
                     now.twist = was.twist + angle
                     if pad.slip >= _0:
                         now = slipped(now, pad.slip)
-            found[env, k] = now
+            contacts[env, k] = now
     if pad.follows_shear == 1 and pressed >= 0:
-        set_shear(env, pad_index, pressed, shear, pad, found)
+        set_shear(env, pad_index, pressed, shear, pad, contacts)
     for k in range(room):
-        now = found[env, k]
+        now = contacts[env, k]
         before[env, k] = now
         for n in range(table.shape[2]):
             table[env, k, n] = wp.float32(0.0)
@@ -341,7 +341,7 @@ def follow(
 
 
 @wp.func
-def set_shear(env: wp.int32, pad_index: wp.int32, body: wp.int32, shear: Shear, pad: Pad, found: wp.array2d(dtype=Contact)):
+def set_shear(env: wp.int32, pad_index: wp.int32, body: wp.int32, shear: Shear, pad: Pad, contacts: wp.array2d(dtype=Contact)):
     """Give the physics' shear of one body to the contact at its place."""
     if shear.load[env, pad_index, body][0] <= _0:
         return
@@ -350,18 +350,18 @@ def set_shear(env: wp.int32, pad_index: wp.int32, body: wp.int32, shear: Shear, 
     if not wp.isfinite(total) or (centre[0] == _0 and centre[1] == _0 and centre[2] == _0):
         return
     nearest, least = wp.int32(-1), wp.float64(1e30)
-    for k in range(found.shape[1]):
-        if found[env, k].active == 1:
-            place = found[env, k].place
+    for k in range(contacts.shape[1]):
+        if contacts[env, k].active == 1:
+            place = contacts[env, k].place
             distance = wp.length(wp.vec2d(place[0], place[1]) - wp.vec2d(centre[0], centre[1]))
             if distance < least:
                 nearest, least = wp.int32(k), distance + _0
     if nearest >= 0:
-        one = found[env, nearest]
+        one = contacts[env, nearest]
         if least <= one.radius + pad.reach:
             one.shear = wp.vec2d(mean[0], mean[1])
             one.twist = mean[2] + _0
-            found[env, nearest] = one
+            contacts[env, nearest] = one
 
 
 @wp.kernel

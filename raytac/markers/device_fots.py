@@ -73,7 +73,7 @@ class DeviceFots:
         self._depth = zeros(len(cells.y), len(cells.x), dtype=wp.float32)
         self._parent, self._box = zeros(len(cells.y) * len(cells.x), dtype=wp.int32), zeros(dtype=wp.vec4i)
         self._moments = zeros(contacts, dtype=contact_kernels.Moments)
-        self._found, self._before = (zeros(contacts, dtype=contact_kernels.Contact) for _ in range(2))
+        self._contacts, self._before = (zeros(contacts, dtype=contact_kernels.Contact) for _ in range(2))
         self._pose, self._pressed = zeros(dtype=wp.mat44d), zeros(dtype=wp.int32)
         self._pose.fill_(_NAN)
         self._pressed.fill_(-1)
@@ -95,10 +95,10 @@ class DeviceFots:
         """
         pool = [height, contact, self._pad, self._depth]
         self._launch(contact_kernels.pool, self._depth.shape, pool)
-        detect = [self._depth, self._pad, self._parent, self._moments, self._box, self._found, self._most]
+        detect = [self._depth, self._pad, self._parent, self._moments, self._box, self._contacts, self._most]
         self._launch(contact_kernels.detect, len(self._box), detect)
         state = [self._before, self._pose, self._pressed, self._table]
-        follow = [poses, pad, depths, sound, shear, self._pad, self._found, *state]
+        follow = [poses, pad, depths, sound, shear, self._pad, self._contacts, *state]
         self._launch(contact_kernels.follow, len(self._box), follow)
         self._launch(fots_kernels.limit, self._drags.shape, [self._table, self._constants, self._drags])
         inputs = [self._xy, self._drags, self._box, self._depth, self._cells, self._constants, self.displacement]

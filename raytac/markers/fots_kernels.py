@@ -53,12 +53,12 @@ class Constants:
 
 @wp.struct
 class Drag:
-    """What drags markers around one contact."""
+    """Shear and twist that one contact gives to the skin."""
 
     active: wp.float32
     """0 or 1."""
     centre: wp.vec2f
-    """Where the skin under the contact's centre was at rest [m]."""
+    """Place at rest of the skin under the contact's centre [m]."""
     shear: wp.vec2f
     """That the skin keeps [m]."""
     turn: wp.vec2f
@@ -83,7 +83,7 @@ def kept_shares(x: wp.float32, y: wp.float32) -> wp.vec2f:
 
 @wp.kernel
 def limit(table: wp.array3d(dtype=wp.float32), motion: Constants, drags: wp.array2d(dtype=Drag)):
-    """What each contact (B, K) drags along; ``table``: as ``Contacts.table``."""
+    """Shear and twist that each contact (B, K) gives to the skin; ``table``: as ``Contacts.table``."""
     b, k = wp.tid()
     m = motion
     drag = Drag()

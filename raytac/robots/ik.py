@@ -268,7 +268,7 @@ class PoseServo:
         servo: Any = Servo()
         servo.joints, servo.anchor, servo.axis, servo.site = (arrays[name] for name in SERVO_READS)
 
-        def numbers(values: np.ndarray | float) -> wp.array:
+        def numbers(values: np.ndarray) -> wp.array:
             return wp.array(values, dtype=wp.float64, device=joints.device)
 
         servo.slides = wp.array(self.arm.slides, dtype=wp.int32, device=joints.device)

@@ -18,7 +18,7 @@ from raytac.world.start_kernels import copy_mask
 
 
 class PadTouch:
-    """What ``PadSurfaces`` and ``MarkerTracker`` compute on the host. Another gel that presses is not shown.
+    """Heights and markers that ``PadSurfaces`` and ``MarkerTracker`` compute on the host. Another gel that presses is not shown.
 
     Attributes:
         height, contact: as of ``DeviceSurround``.
