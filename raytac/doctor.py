@@ -111,7 +111,7 @@ print("jinja2", jinja2.__version__, "pyarrow", pyarrow.__version__, "scikit-imag
 
 _DENOISER = """
 import numpy as np
-from raytac.optics.trace.denoise import make_denoiser
+from raytac.optics.trace.sampled_tracer import make_denoiser
 from raytac.optics.runtime import load_mitsuba
 mi, device = load_mitsuba()
 grey = np.full((32, 32, 3), 0.5, np.float32)

@@ -1,6 +1,6 @@
 """Direct light of point LEDs on a Lambertian coat, with derivatives, in NumPy for fits.
 
-It is the diffuse part of the ray tracer's own sum (``raytac.optics.trace.direct``) with one point an LED and no visibility:
+It is the diffuse part of the ray tracer's own sum (``raytac.optics.trace.fast_tracer``) with one point an LED and no visibility:
 
     D = c^n · cos θ · d₀² / r²,  c = −w · a,  cos θ = w · n_p,  w = (l − p) / r,
 

@@ -9,9 +9,8 @@ from typing import Protocol
 import numpy as np
 
 from raytac.errors import InputError, SpecError
-from raytac.shapes.coin import coin_elevation
 from raytac.shapes.part import Part, mesh_part, primitive
-from raytac.shapes.relief import relief_part
+from raytac.shapes.relief import coin_elevation, relief_part
 from raytac.specs.press import ObjectSpec
 from raytac.specs.shape_file import OBJECT_SCHEMA
 
