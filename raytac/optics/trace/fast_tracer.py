@@ -1,4 +1,4 @@
-"""``FastTracer``: quadrature over the LEDs and a smooth field of inter-reflection; nothing is random.
+"""``FastTracer``: quadrature over the LEDs, smooth inter-reflection; nothing is random.
 
 For each pixel one camera ray meets the coat, and for each LED the rendering equation's direct term is summed over a small grid of
 points on its rectangle (Kajiya 1986, eq. 1 restricted to one bounce; area form of Shirley, Wang and Zimmerman 1996):

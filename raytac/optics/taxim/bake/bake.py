@@ -26,10 +26,10 @@ from raytac.optics.taxim.table import PolyTable, ShadowTable, TaximConstants, sl
 from raytac.specs.sensor import SensorSpec
 
 MOVED = 5e-6
-"""Least displacement [m] of a pixel that counts as a sample: a hundredth of a usual press, which changes an image by less than rounding."""
+"""Least displacement [m] of a sample: a hundredth of a usual press, too little to show."""
 
 PLAIN = TaximConstants(background_sigma=1.0, background_share=0.0, background_threshold=1e3, shadow_sigma=0.0, final_sigma=0.0)
-"""The background is the image at rest as it is, and nothing is blurred: what comes out is what the ray tracer showed."""
+"""The image at rest is the background as it is, and nothing is blurred."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ def baked_table(
     settings: BakeSettings | None = None,
     progress: bool = True,
 ) -> PolyTable:
-    """The table of ``bake``, with its arguments and errors, baked once and kept under a digest of sensor, lights, settings and code.
+    """The table of ``bake``, with its arguments and errors, baked once and kept in a cache.
 
-    It is kept in the user's cache, as a calibration folder; an entry that is damaged is baked again, with a warning. An interrupt leaves
-    nothing there. Where the cache cannot be written the table is used and not kept, with a warning. A cached table may come from the
-    other device, whose images differ by rounding.
+    It is a calibration folder under a digest of sensor, lights, settings and code; a damaged one is baked again, with a warning. An
+    interrupt leaves nothing there. Where the cache cannot be written the table is used and not kept, with a warning. A cached table may
+    come from the other device, whose images differ by rounding.
     """
     settings = BakeSettings() if settings is None else settings
     folder = table_folder(sensor, settings, seed, resolution or sensor.camera.resolution)
@@ -135,7 +135,7 @@ def bake_shadow(
     seed: int = 0,
     tick: Callable[[int], object] = lambda count: None,
 ) -> ShadowTable:
-    """The shadow table alone, in the levels of ``at``'s images; ``tick`` is called with the number of rendered images, six a pin in all."""
+    """The shadow table alone, in levels of ``at``; ``tick`` is called with numbers of images."""
     settings = BakeSettings() if settings is None else settings
     pad, grid, camera = at.sensor.gelpad, at.grid, at.tracer.camera
     shades = ShadowSums(2 * PLAIN.ring_dilations, settings.depth_range(pad.thickness)[1], camera.resolution)
