@@ -34,7 +34,7 @@ CUDA_MINIMUM = (12, 2)
 CUDA_REFUSED = (12, 7)
 """CUDA whose OptiX Dr.Jit 1.5 refuses."""
 LLVM_NAMED_BY_USER = bool(os.environ.get("DRJIT_LIBLLVM_PATH"))
-"""True if the environment named a libLLVM before raytac started; else ``raytac.optics``, which imports this first, names one."""
+"""True if the environment named a libLLVM at the start; else ``raytac.optics`` names one."""
 LLVM_MINIMUM = 16
 """Oldest LLVM looked for: Dr.Jit 1.5 refuses 14, and 15 was seen to abort the process."""
 

@@ -100,7 +100,7 @@ class SpecError(RaytacError, ValueError):
         choices: Iterable[object] = (),
         hint_for: str | None = None,
     ) -> None:
-        """``hint_for`` is the word to find a close match for among ``choices`` (default: ``value`` when it is a string)."""
+        """``hint_for``: word to match among ``choices`` (default: a ``value`` that is a string)."""
         self.file = Path(file) if file is not None else None
         self.key = key
         self.value = value

@@ -19,7 +19,7 @@ class Registry(Generic[Config]):
     """
 
     def __init__(self, argument: str, built_in: Mapping[str, str]) -> None:
-        """``argument``: what users call this axis, for error messages; ``built_in``: ``module:Class`` of each name."""
+        """``argument``: name of this axis in errors; ``built_in``: ``module:Class`` of each name."""
         self.argument = argument
         self._classes: dict[str, str | type[Config]] = dict(built_in)
 
@@ -74,7 +74,7 @@ class Registry(Generic[Config]):
         return config(**options)
 
     def name_of(self, config: Config) -> str:
-        """Name under which the class of a configuration is registered; the class's own name if it is not."""
+        """Name that the class of a configuration is registered by; the class's own otherwise."""
         for name in self.names:
             entry = self._classes[name]
             if isinstance(entry, str):

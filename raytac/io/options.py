@@ -20,7 +20,7 @@ class CommonOptions:
     """
 
     out: Path | None = None
-    """Folder to write to, created if need be; a folder under runs/ named after the job if not given."""
+    """Folder to write to, created if need be; one under runs/ for the job if not given."""
     device: DeviceName = "auto"
     """Device to compute on; auto is CUDA if it works, else the CPU."""
     seed: int = 0

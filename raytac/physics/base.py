@@ -40,7 +40,7 @@ class PadReading:
     """
 
     stage: int = -1
-    """Index in the press scene's trajectory; −1 before the first stage, of a stage that is not the scene's, and in a world."""
+    """Index in the scene's trajectory; −1 before the first stage, of other stages, in a world."""
     kind: str = ""
     """Kind of that stage, or ``start``; empty in a world."""
     fraction: float = 1.0
@@ -63,7 +63,7 @@ class PadReading:
         solved: Any = None,
         shear: ContactShear | None = None,
     ) -> None:
-        """Keep what is given (see the class), and call a function when its result is first asked for; None is not known."""
+        """Keep what is given (see the class); a function is called on demand, None is not known."""
         self._surface, self._wrench, self._traction, self.has_forces = surface, wrench, traction, wrench is not None
         self.failed = np.zeros(self.surface.batch, bool) if failed is None else failed
         self.unconverged, self.force_law_area = unconverged, force_law_area

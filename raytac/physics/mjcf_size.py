@@ -14,7 +14,7 @@ from pathlib import Path
 from raytac.errors import InputError
 
 MOST_COPIES = 100_000
-"""Copies that ``replicate``, ``composite`` and ``flexcomp`` elements within each other may make of what is in them."""
+"""Copies that nested ``replicate``, ``composite`` and ``flexcomp`` elements may make."""
 MOST_NODES = 2**22
 """Nodes of a height field."""
 _LARGEST = 2**26

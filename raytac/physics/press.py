@@ -162,7 +162,7 @@ class PressTargets:
 
 
 CLEARANCE = 1e-3
-"""Height above first touch [m] at which an object waits before the press and after a release."""
+"""Height above first touch [m] at which an object waits before a press, after a release."""
 MOST_STEPS = 1_000_000
 """States that a stage can be asked for."""
 

@@ -1,4 +1,4 @@
-"""``TactileSensor``: one sensor, one physics, one optical mode; a press goes in, a frame comes out."""
+"""``TactileSensor``: one sensor, physics and optical mode; a press in, a frame out."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ class TactileSensor:
 
     @property
     def sampling(self) -> dict[str, int | float | str]:
-        """``integrator``, ``spp`` and ``exposure`` of the optical mode; empty without images or rays."""
+        """``integrator``, ``spp``, ``exposure`` of the optical mode; empty without images or rays."""
         return getattr(self.optical_mode, "sampling", {}) if self._optical_outputs else {}
 
     @property
@@ -174,7 +174,7 @@ class TactileSensor:
         progress: bool = False,
         **own: Any,
     ) -> TactileFrame:
-        """Run the scene's trajectory and return the frame at its peak: at the end of the last stage but a release.
+        """Run the scene's trajectory; frame at its peak: the end of the last stage but a release.
 
         A mesh file or an array of heights [m] is pressed in to ``depth`` [m]; ``scale`` [m per file unit] and ``pitch`` [m] as in
         ``raytac.specs.press_of``. ``own``: settings by environment, as ``load`` takes them. ``progress``: a soft pad, which takes
@@ -299,7 +299,7 @@ class TactileSensor:
         return outputs
 
     def _check_width(self, state: PadReading, cells: np.ndarray) -> None:
-        """Warn once a press of a contact that the pad's cells cannot resolve, where a stage to a depth ends.
+        """Warn once a press of a contact too narrow for the pad's cells, as a stage to a depth ends.
 
         Between the ends of stages every contact is narrow once.
         """

@@ -1,4 +1,4 @@
-"""A relief, a raised pattern on a face that looks (about) straight down: its underside, and the pattern of raytac's coin."""
+"""A relief, a raised pattern on a face that looks about straight down, such as a coin's."""
 
 from __future__ import annotations
 

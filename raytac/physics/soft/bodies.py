@@ -42,7 +42,7 @@ class SceneBody:
     friction: float | None = None
     """μ against pads and bodies; None: each pad's own against pads."""
     skin: SoftSkin | None = None
-    """Smooth surface of a soft one, which a pad in contact is shown to touch; None: the faces of its tetrahedra."""
+    """Smooth surface of a soft one, shown in contact; None: the faces of its tetrahedra."""
 
     @property
     def name(self) -> str:

@@ -84,7 +84,7 @@ class SoftPad(PressPad):
             self._drive = PressController(scene, self.solver, self._reader, self._places, self.targets)
 
     def run(self, steps_per_stage: int = 1, *, progress: bool = False) -> Iterator[PadReading]:
-        """Readings as of ``PressPad``; ``progress``: shows the solver's steps with the stage beside it."""
+        """Readings as of ``PressPad``; ``progress`` shows the solver's steps and the stage."""
         with Progress(desc=f"press {self.scene.name}", unit="step", show=progress, leave=False) as bar:
             self._bar = bar
             if self._drive is not None:

@@ -15,11 +15,11 @@ _FINEST = 1e-6
 _EDGE = 0.3
 """Longest edge of the skin over the mean edge of the tetrahedra."""
 _NEIGHBOURS = 30
-"""Least number of vertices that each point of the skin depends on; so many also average out the pad's facets."""
+"""Least number of vertices that a point of the skin depends on; they average out facets."""
 _WIDER = 1.15
 """Radius of the weights over the distance of the farthest of them."""
 _REGULAR = 1e-3
-"""Weight against bending, over that of the vertices: vertices on a sphere do not determine all second derivatives."""
+"""Weight against bending: vertices on a sphere do not determine all second derivatives."""
 _CHUNK = 1000
 """Points processed at once."""
 
