@@ -20,9 +20,9 @@ from raytac.gel.surface import GelSurface, make_grid
 from raytac.optics.image.config import Phong
 from raytac.optics.image.mlp_weights import INPUTS, LEVELS, MlpWeights, inputs, view_size, view_slope
 from raytac.optics.response import fit_log_gain
-from raytac.optics.taxim.bake.bake import PLAIN, bake_shadow
 from raytac.optics.taxim.bake.fit import BinSums, two_sheets
-from raytac.optics.taxim.bake.settings import BakeSettings
+from raytac.optics.taxim.bake.settings import PLAIN, BakeSettings
+from raytac.optics.taxim.bake.shadow import bake_shadow
 from raytac.optics.taxim.bake.views import Calibration
 from raytac.optics.taxim.table import PolyTable, slope_bins
 from raytac.optics.trace.config import RayTraced

@@ -139,10 +139,6 @@ class ControlWriter:
         inputs = [places, wp.array(list(actuators), dtype=wp.int32, device="cpu"), self.controls, self._chosen]
         self._write = Recorded(partial(wp.launch, write_numbers, dim=self.controls.shape, inputs=inputs, device="cpu"))
 
-    def writes(self, datas: Sequence[mujoco.MjData]) -> bool:
-        """True if it writes to these states."""
-        return same_states(datas, self._datas)
-
     def write(self, envs: Sequence[int] | np.ndarray) -> np.ndarray | None:
         """Write the controls of environments; or return the first that are not finite, writing none."""
         chosen = self._values if len(envs) == len(self._datas) else self._values[envs]

@@ -9,27 +9,22 @@ from the ray tracer*).
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from itertools import chain
+from dataclasses import dataclass
 
 import numpy as np
 
 from raytac.io.progress import Progress
 from raytac.optics.taxim.bake.fit import BinFit, BinSums, two_sheets
-from raytac.optics.taxim.bake.presses import ball_presses, pin_presses
-from raytac.optics.taxim.bake.settings import BakeSettings
-from raytac.optics.taxim.bake.shadow import ShadowSums
+from raytac.optics.taxim.bake.presses import ball_presses
+from raytac.optics.taxim.bake.settings import PLAIN, BakeSettings
+from raytac.optics.taxim.bake.shadow import bake_shadow
 from raytac.optics.taxim.bake.views import Calibration, Views
 from raytac.optics.taxim.cache import cached, keep, table_folder
-from raytac.optics.taxim.table import PolyTable, ShadowTable, TaximConstants, slope_bins
+from raytac.optics.taxim.table import PolyTable, slope_bins
 from raytac.specs.sensor import SensorSpec
 
 MOVED = 5e-6
 """Least displacement [m] of a sample: a hundredth of a usual press, too little to show."""
-
-PLAIN = TaximConstants(background_sigma=1.0, background_share=0.0, background_threshold=1e3, shadow_sigma=0.0, final_sigma=0.0)
-"""The image at rest is the background as it is, and nothing is blurred."""
 
 
 @dataclass(frozen=True)
@@ -126,26 +121,6 @@ def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: in
         },
     )
     return Baked(table, fit, images, at)
-
-
-def bake_shadow(
-    at: Calibration,
-    *,
-    settings: BakeSettings | None = None,
-    seed: int = 0,
-    tick: Callable[[int], object] = lambda count: None,
-) -> ShadowTable:
-    """The shadow table alone, in levels of ``at``; ``tick`` is called with numbers of images."""
-    settings = BakeSettings() if settings is None else settings
-    pad, grid, camera = at.sensor.gelpad, at.grid, at.tracer.camera
-    shades = ShadowSums(2 * PLAIN.ring_dilations, settings.depth_range(pad.thickness)[1], camera.resolution)
-    # Pins, whose walls are as steep as the surround allows, and as many single balls, whose flanks cast little.
-    single = replace(settings, images=settings.pins, balls=1, bare_share=0.0)
-    presses = chain(pin_presses(pad, grid, camera, settings, seed), ball_presses(pad, grid, camera, single, seed + 1))
-    for views, cast in at.shadow_views(presses):
-        shades.add(views, cast, at.rest_image)
-        tick(3 * len(views.rgb))
-    return shades.table()
 
 
 def add_samples(sums: BinSums, views: Views, rest_image: np.ndarray, own: np.ndarray) -> None:

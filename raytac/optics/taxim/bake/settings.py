@@ -6,6 +6,10 @@ from dataclasses import dataclass
 
 from raytac.checks import check_number, check_numbers, check_whole
 from raytac.errors import InputError
+from raytac.optics.taxim.table import TaximConstants
+
+PLAIN = TaximConstants(background_sigma=1.0, background_share=0.0, background_threshold=1e3, shadow_sigma=0.0, final_sigma=0.0)
+"""The image at rest is the background as it is, and nothing is blurred."""
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,15 @@ casts (``ShadowTable.depth_of`` = ``"drop"``): a shadow reaches as far as drop a
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import chain
+
 import numpy as np
 
-from raytac.optics.taxim.bake.views import Views
+from raytac.optics.taxim.bake.presses import ball_presses, pin_presses
+from raytac.optics.taxim.bake.settings import PLAIN, BakeSettings
+from raytac.optics.taxim.bake.views import Calibration, Views
 from raytac.optics.taxim.table import ShadowTable
 
 DIRECTION_PRECISION, STEP = 0.1, 1.25
@@ -85,6 +91,26 @@ class ShadowSums:
         values[np.arange(values.shape[-1]) >= lengths[..., None]] = 0
         bins = {"first_depth": 0.0, "depth_precision": DEPTH_PRECISION, "depth_offset": 0, "depth_of": "drop"}
         return ShadowTable(self.directions, values, lengths, direction_precision=DIRECTION_PRECISION, step=STEP, **bins)
+
+
+def bake_shadow(
+    at: Calibration,
+    *,
+    settings: BakeSettings | None = None,
+    seed: int = 0,
+    tick: Callable[[int], object] = lambda count: None,
+) -> ShadowTable:
+    """The shadow table alone, in levels of ``at``; ``tick`` is called with numbers of images."""
+    settings = BakeSettings() if settings is None else settings
+    pad, grid, camera = at.sensor.gelpad, at.grid, at.tracer.camera
+    shades = ShadowSums(2 * PLAIN.ring_dilations, settings.depth_range(pad.thickness)[1], camera.resolution)
+    # Pins, whose walls are as steep as the surround allows, and as many single balls, whose flanks cast little.
+    single = replace(settings, images=settings.pins, balls=1, bare_share=0.0)
+    presses = chain(pin_presses(pad, grid, camera, settings, seed), ball_presses(pad, grid, camera, single, seed + 1))
+    for views, cast in at.shadow_views(presses):
+        shades.add(views, cast, at.rest_image)
+        tick(3 * len(views.rgb))
+    return shades.table()
 
 
 def dilated(mask: np.ndarray, pixels: int) -> np.ndarray:
