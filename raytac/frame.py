@@ -24,10 +24,7 @@ IMAGES = ("rgb", "layers", "normals", "position", "depth", "contact", "uncovered
 
 
 class MissingOutputError(InputError, AttributeError):
-    """A field of a frame that was not asked for, or cannot be.
-
-    The message says how to ask for it.
-    """
+    """A field of a frame that was not asked for, or cannot be; the message says how to ask."""
 
 
 _ASK = {

@@ -66,10 +66,7 @@ def led_light(seen: PixelGeometry, led: np.ndarray, reference: float) -> LedLigh
 
 
 def case_light(seen: PixelGeometry) -> np.ndarray:
-    """Irradiance (M,) of a case of even radiance 1 / π on the coat, (1 − n_z) / 2.
-
-    It is the share of the hemisphere that lies below the pad.
-    """
+    """Irradiance (M,) of a case of radiance 1 / π: its share of the hemisphere, (1 − n_z) / 2."""
     return 0.5 * (1 - seen.n[2])
 
 

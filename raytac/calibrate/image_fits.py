@@ -189,10 +189,7 @@ def fit_mlp(
     settings: MlpSettings = MlpSettings(),
     tick: Callable[[int], None] | None = None,
 ) -> MlpWeights:
-    """Network of ``samples`` over the real ``background`` (H, W, 3) [levels].
-
-    ``tick`` is called with the number of passes done so far.
-    """
+    """Network of ``samples`` over ``background`` (H, W, 3) [levels]; ``tick`` counts passes."""
     rng = np.random.default_rng(seed)
     height, width = background.shape[:2]
     chosen = rng.permutation(len(samples.row))[: settings.samples]

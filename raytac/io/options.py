@@ -14,10 +14,7 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 
 @dataclass(frozen=True, kw_only=True)
 class CommonOptions:
-    """Base of an ``Args`` dataclass.
-
-    Write ``@dataclass(frozen=True, kw_only=True) class Args(CommonOptions)``.
-    """
+    """Base of ``@dataclass(frozen=True, kw_only=True) class Args(CommonOptions)``."""
 
     out: Path | None = None
     """Folder to write to, created if need be; one under runs/ for the job if not given."""

@@ -79,10 +79,7 @@ class PadReading:
 
     @cached_property
     def wrench(self) -> np.ndarray:
-        """Force on the pad [N] and torque about the frame's origin [N m], (B, 6).
-
-        NaN of a bare surface.
-        """
+        """Force on the pad [N], torque about the frame's origin [N m], (B, 6); NaN if not known."""
         if self._wrench is None:
             return np.full((len(self.failed), 6), np.nan)
         return self._wrench(self.surface) if callable(self._wrench) else self._wrench
@@ -150,10 +147,7 @@ class Pad(Protocol):
         ...
 
     def object_height(self, surface: GelSurface) -> np.ndarray | None:
-        """Underside of the object at the surface's poses [m], (B, Ny, Nx).
-
-        inf where it is not; None without an object.
-        """
+        """Underside of the object [m], (B, Ny, Nx), inf where it is not; None without an object."""
         ...
 
 

@@ -65,10 +65,7 @@ class Ipc:
         return f"ipc-{level if isinstance(level, str) else 'own'}"
 
     def build(self, spec: SensorSpec, press: PressScene, *, device: str = "auto", **settings: Any) -> SoftPad:
-        """The pad of a press, as ``PhysicsConfig.build``.
-
-        The solver traces no rays, so that CUDA needs no OptiX.
-        """
+        """The pad of a press, as ``PhysicsConfig.build``; no ray is traced: CUDA needs no OptiX."""
         from raytac.physics.soft.pad import SoftPad
 
         device = resolve_device(device, ray_tracing=False)

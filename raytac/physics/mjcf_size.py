@@ -1,7 +1,4 @@
-"""Size of a MuJoCo model, read from its XML before it is compiled.
-
-Compiling takes as much time and memory as the XML asks for.
-"""
+"""Size of a MuJoCo model, read from its XML before compiling, which takes what that asks."""
 
 from __future__ import annotations
 

@@ -94,10 +94,7 @@ def _coin(spec: Shape) -> tuple[Part, ...]:
 
 
 def _heights(spec: ObjectSpec) -> Part:
-    """The map in a square of zeros, which are no object.
-
-    Beyond its last rows and columns the height falls to 0 over one pitch.
-    """
+    """The map in a square of zeros, no object; at its ends it falls to 0 over one pitch."""
     data, pitch = np.array(spec.heights), _length(spec, "pitch")
     rows, columns = data.shape
     n = max(rows, columns)

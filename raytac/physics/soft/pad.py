@@ -1,7 +1,4 @@
-"""The soft pad: the gel simulated with contact, friction and large deformation.
-
-Object or case are driven, or the object lies free.
-"""
+"""The soft pad: gel with contact, friction, large deformation, under driven or free bodies."""
 
 from __future__ import annotations
 

@@ -260,10 +260,7 @@ class SoftReader:
     def _underside(
         self, state: CoatState, b: int, grid: PadGrid, clearance: float = 0.0, smooth: np.ndarray | None = None
     ) -> np.ndarray:
-        """Underside of the shown objects over a grid [m], (Ny, Nx).
-
-        Without what lies far below the ``smooth`` coat, if given.
-        """
+        """Underside of the objects over a grid [m], (Ny, Nx), but for what is far below ``smooth``."""
         under = state.underside(b, grid.x, grid.y, float(grid.rest.max()), lowered=clearance)
         if len(state.objects) > 1 and smooth is not None:
             under[under < smooth - _BEHIND] = np.inf

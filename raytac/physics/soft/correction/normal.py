@@ -159,10 +159,7 @@ class NormalCorrection:
         return load > self.settings.least_load * load.max()
 
     def _mesh_forces(self, upwards: np.ndarray, touching: np.ndarray) -> np.ndarray:
-        """Forces along z [N], (V,), on ``touching`` vertices that lift the linear mesh ``upwards``.
-
-        0 where it is bonded.
-        """
+        """Forces [N], (V,), on ``touching`` vertices that lift the mesh ``upwards``; 0 if bonded."""
         free = touching & (np.diagonal(self._compliance) > 0.0)
         forces = np.zeros(len(upwards))
         forces[free] = np.linalg.solve(self._compliance[np.ix_(free, free)], upwards[free])
