@@ -37,11 +37,7 @@ def parse_resolution(text: str) -> tuple[int, int]:
 
 
 def parse_names(text: str, option: str, choices: tuple[str, ...] | None = None) -> tuple[str, ...]:
-    """``"sphere, coin"`` to ``("sphere", "coin")``: names joined by commas, each once.
-
-    Raises:
-        InputError: none, or one that is not in ``choices`` (None is any).
-    """
+    """Names joined by commas, each once; ``InputError`` for none, or if not in ``choices``."""
     names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
     for name in names:
         if choices is not None and name not in choices:

@@ -88,11 +88,7 @@ def _unescaped(text: str) -> str:
 
 
 def _is_file(path: Path) -> bool:
-    """True if ``path`` is a file, False if nothing is there.
-
-    Raises:
-        InputError: something else is there; opening it may wait for ever.
-    """
+    """True for a file, False for nothing; ``InputError`` for what may wait for ever."""
     try:
         if path.is_file() or not path.exists():
             return path.is_file()

@@ -61,11 +61,7 @@ def _size(declared: Any) -> tuple[int, int]:
 
 @functools.cache
 def checked_layouts() -> tuple[Layout, Layout]:
-    """Layouts of ``mjData`` and ``mjContact``.
-
-    Raises:
-        BackendError: this MuJoCo keeps its states otherwise than it declares.
-    """
+    """Layouts of ``mjData`` and ``mjContact``; ``BackendError`` if MuJoCo's differ."""
     state, contact = layout("mjData"), layout("mjContact")
     model = mujoco.MjModel.from_xml_string(_BALLS)
     data = mujoco.MjData(model)

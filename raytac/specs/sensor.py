@@ -217,11 +217,7 @@ class ResponseSpec:
 
     @property
     def gain(self) -> float:
-        """The exposure as a number.
-
-        Raises:
-            SpecError: it is ``AUTO``, and nobody has rendered the image at rest (``raytac.optics.trace.fast_tracer.with_exposure``).
-        """
+        """The exposure as a number; ``SpecError`` for ``AUTO``, which ``with_exposure`` replaces."""
         if self.exposure == AUTO:
             raise SpecError("must be a number here: with_exposure finds it", key="response.exposure", value=AUTO)
         return self.exposure

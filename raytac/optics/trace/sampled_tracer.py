@@ -65,11 +65,7 @@ class SampledTracer(Tracer):
         return lambda: images
 
     def render_device(self, heights: Float, contact: UInt8 | None = None, ink: Float | None = None) -> NoReturn:
-        """Refuse: what is summed up over samples is an image on the host.
-
-        Raises:
-            InputError: always.
-        """
+        """Refuse with ``InputError``: what is summed up over samples is an image on the host."""
         rule = "must be taxim, phong or raytrace with the integrator fast to stay on the device"
         raise InputError("optics", value=self.label, rule=rule)
 
