@@ -1,9 +1,7 @@
 """``raytac doctor``: try what the jobs need, and say what will be used and how to mend it.
 
-Each trial is a process of its own.
-
-A library that aborts (LLVM 15 does, inside Dr.Jit, on some machines) takes its process down before Python can say a word; here it
-takes down only its probe.
+Each trial is a process of its own. A library that aborts (LLVM 15 does, inside Dr.Jit, on some machines) takes its process down
+before Python can say a word; here it takes down only its probe.
 """
 
 from __future__ import annotations

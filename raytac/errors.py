@@ -117,9 +117,8 @@ class MeshError(SpecError):
 def short_repr(value: object, limit: int = 80) -> str:
     """``repr`` cut to ``limit`` characters, for any value.
 
-    A path is plain text, and whole up to ``_LONGEST_PATH`` characters.
-
-    Integers too long to be printed, deep and long containers, and objects whose ``repr`` fails are abbreviated.
+    A path is plain text, and whole up to ``_LONGEST_PATH`` characters. Integers too long to be printed, deep and long containers,
+    and objects whose ``repr`` fails are abbreviated.
     """
     if isinstance(value, Path):
         text = str(value)

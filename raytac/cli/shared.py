@@ -47,10 +47,9 @@ def read_data(
 ) -> tuple[SensorSpec, RealPresses, Photographs, list[str]]:
     """The sensor, its fully visible presses as read and as floats, and names of doubtful ones.
 
-    A press is doubtful if its circle was found in the image without a clear step of colour.
-
-    ``sides`` as of ``leds_at_walls``, or ``OWN_LEDS``, each of which then is ``split`` into so many. ``device``: where an exposure of
-    ``AUTO`` is found, under the sensor's own lights.
+    A press is doubtful if its circle was found in the image without a clear step of colour. ``sides`` as of ``leds_at_walls``, or
+    ``OWN_LEDS``, each of which then is ``split`` into so many. ``device``: where an exposure of ``AUTO`` is found, under the
+    sensor's own lights.
 
     Raises:
         SpecError, InputError, CalibrationError: as the readers say.

@@ -154,9 +154,8 @@ class Pad(Protocol):
 class PhysicsConfig(Protocol):
     """Configuration of one physics: a frozen dataclass that checks itself.
 
-    ``raytac.physics.register`` makes it known by a name.
-
-    A field ``level`` that is None is filled with the scene's, else ``coarse``.
+    ``raytac.physics.register`` makes it known by a name. A field ``level`` that is None is filled with the scene's, else
+    ``coarse``.
     """
 
     is_simulated: ClassVar[bool]

@@ -29,14 +29,13 @@ def object_parts(spec: Shape) -> tuple[Part, ...]:
     """Parts of the object, object frame [m]; empty for ``none``.
 
     The −z side looks at the pad when the quaternion is the identity. ``sphere``: centre at the origin. ``cylinder``: axis z,
-    centre at the origin (standing; turn it by 90° about y to lie along x). ``box``: length along x, width along y, height along z,
-    centre at the origin. ``edge``: a cube about the origin with one edge down, along x. ``cone``: rounded tip down at the origin,
-    base of the given radius at ``height`` above it. ``torus``: axis z, lying flat. ``pins``: a plate with rows × columns (y × x)
-    of flat-ended pins, ``pin_height`` long, under its face z = 0. ``plane``: the half-space under z = 0 (task scenes only).
-    ``coin``: face down, field at z = 0. ``mesh``: as its file has it. ``mjcf``: every geom of one body, body frame.
-    ``heights``: a relief under z = 0, centred.
-    Curved parts are exact shapes, not facets. Raises ``SpecError`` for an unknown kind, a missing or impossible length, or a model
-    that MuJoCo refuses or that has no such body.
+    centre at the origin (standing; turn it by 90° about y to lie along x). ``box``: length along x, width along y, height along
+    z, centre at the origin. ``edge``: a cube about the origin with one edge down, along x. ``cone``: rounded tip down at the
+    origin, base of the given radius at ``height`` above it. ``torus``: axis z, lying flat. ``pins``: a plate with rows × columns
+    (y × x) of flat-ended pins, ``pin_height`` long, under its face z = 0. ``plane``: the half-space under z = 0 (task scenes
+    only). ``coin``: face down, field at z = 0. ``mesh``: as its file has it. ``mjcf``: every geom of one body, body frame.
+    ``heights``: a relief under z = 0, centred. Curved parts are exact shapes, not facets. Raises ``SpecError`` for an unknown
+    kind, a missing or impossible length, or a model that MuJoCo refuses or that has no such body.
     """
     if spec.kind == "plane":
         return (primitive("plane"),)

@@ -299,9 +299,7 @@ class SoftScene:
     ) -> None:
         """Return environments to rest, without history, at the initial poses or others.
 
-        Shapes as for the scene itself.
-
-        Raises ``OverlapError`` if bodies overlap at these poses; nothing has changed then.
+        Shapes as for the scene itself. Raises ``OverlapError`` if bodies overlap at these poses; nothing has changed then.
         """
         mask = np.isin(np.arange(self.num_envs), chosen_envs(envs, self.num_envs))
         if world_from_pad is None and world_from_body is None:
