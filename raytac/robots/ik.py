@@ -1,4 +1,4 @@
-"""Inverse kinematics of one arm in two ways: by a quadratic program that keeps every limit, and by damped least squares for a batch.
+"""Inverse kinematics: a quadratic program that keeps limits; damped least squares.
 
 ``DifferentialIk`` is for one arm that must not break a limit: a viewer, a demonstration, a search for joint positions. Each call solves a
 quadratic program in about a millisecond with mink (K. Zakka, Apache-2.0) on DAQP:
@@ -66,7 +66,7 @@ class IkResult:
 
 
 class DifferentialIk:
-    """Differential inverse kinematics of one arm. It has work arrays, but no state between calls."""
+    """Differential inverse kinematics of one arm; work arrays, but no state between calls."""
 
     def __init__(
         self,
@@ -113,7 +113,7 @@ class DifferentialIk:
         self._box = _box_limit(arm, self.max_velocity)
 
     def velocity(self, qpos: np.ndarray, world_from_target: np.ndarray, duration: float) -> np.ndarray:
-        """Joint velocities (n,) towards ``world_from_target`` (4, 4) within ``duration`` [s], as far as limits allow.
+        """Joint velocities (n,) to ``world_from_target`` (4, 4) in ``duration`` [s], within limits.
 
         ``qpos`` (nq,) is the whole model's; joints of other parts stay. A joint beyond its range (MuJoCo's limits are soft)
         moves back at its greatest speed.
@@ -138,7 +138,7 @@ class DifferentialIk:
         restarts: int = 10,
         seed: int = 0,
     ) -> IkResult:
-        """Search joint positions with the site at ``world_from_target`` (4, 4) by repeated steps from ``qpos`` (nq,).
+        """Search joint positions with the site at ``world_from_target`` (4, 4) from ``qpos`` (nq,).
 
         A search that does not arrive within ``steps``, or stalls, is started again from random positions within the limits, up to
         ``restarts`` times, since a descent within joint limits can end in a corner. The posture is not used. Returns the first result
@@ -317,7 +317,7 @@ def _mink() -> Any:
 
 
 def _box_limit(arm: Arm, max_velocity: np.ndarray) -> Any:
-    """Bounds on Δq of the arm's joints only, never contradictory; mink's own would also limit joints of other bodies."""
+    """Bounds on Δq of the arm's joints, never contradictory; mink's own limit other bodies too."""
     mink = _mink()
     rows = np.eye(arm.model.nv)[arm.dof]
     bounded = np.concatenate([rows, -rows])

@@ -1,4 +1,4 @@
-"""Differences of many poses by one kernel: dozens of them take NumPy as long as a step of MuJoCo."""
+"""Differences of many poses by one kernel: NumPy takes as long for dozens as MuJoCo's step."""
 
 from __future__ import annotations
 
