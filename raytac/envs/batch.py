@@ -253,6 +253,7 @@ class TaskBatch:
             body_speed=self._body_speed,
             goal=self._goal,
             wrench=wrench,
+            opening=self._opening,
             joint_speed=joint_speed,
             action=actions,
             last_action=last,

@@ -1,4 +1,4 @@
-"""``raytac/LiftCube-v1``."""
+"""``raytac/LiftCube-v2``."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from raytac.envs.environments import TactileEnv, TactileVectorEnv
 from raytac.envs.task_rules import Array, Motion, Starts, Task, TaskResult, TaskState, between, distances, moved, near
 from raytac.se3 import pose
 
+_WIDTH = 0.03
+"""Of the cube [m]."""
 _LIFTED = 0.04
 """Height of the centre of a lifted cube [m]; at rest it is 0.015."""
 
@@ -45,6 +47,7 @@ class LiftCube(Task):
         terms = {
             "reaching": near(reach, 0.1),
             "reaching_fine": near(reach, 0.02),
+            "closing": near(reach, 0.02) * (1.0 - ((state.opening[:, 0] - _WIDTH) / (0.08 - _WIDTH)).clip(0.0, 1.0)),
             "held": 2.0 * held,
             "lifted": 15.0 * rise,
             "goal": 16.0 * rise * near(distance, 0.3),
@@ -73,7 +76,7 @@ class LiftCubeEnv(TactileEnv):
       velocity [rad/s] (6); there unless `body_seen=False`;
     - `left_markers`, `right_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` selects others (docs/rl.md).
 
-    Reward: sum of the terms in `info["reward_terms"]`, those of Isaac Lab's Isaac-Lift-Cube-Franka-v0 and two that lead up to them.
+    Reward: sum of the terms in `info["reward_terms"]`, those of Isaac Lab's Isaac-Lift-Cube-Franka-v0 and three that lead up to them.
     Held: both pads are pressed with more than 0.5 N. r rises from 0 where the cube's centre is 15.5 mm high, which is a hair above rest,
     to 1 at 40 mm; it is 0 if the cube is not held.
 
@@ -81,6 +84,7 @@ class LiftCubeEnv(TactileEnv):
     | --- | --- | --- |
     | `reaching` | 1 − tanh(d(tool, cube) / 0.1) | Isaac Lab |
     | `reaching_fine` | 1 − tanh(d(tool, cube) / 0.02) | ours |
+    | `closing` | (1 − tanh(d(tool, cube) / 0.02)) c; c rises from 0 with the pads 80 mm apart to 1 at the cube's 30 mm | ours |
     | `held` | 2 if held | ours |
     | `lifted` | 15 r | Isaac Lab, where r is 1 above 40 mm, else 0 |
     | `goal` | 16 r (1 − tanh(d(cube, goal) / 0.3)) | the same |
@@ -93,6 +97,8 @@ class LiftCubeEnv(TactileEnv):
     Termination: the tool is more than 1 m from the cube (TacEx thesis). Truncation: 250 steps (5 s, as Isaac Lab), or the physics fails.
     Success: the cube's centre is above 40 mm and within 20 mm of the goal.
 
+    Version 2: closing the hand about the cube is worth something. In version 1 nothing was between reaching the cube and holding it, for
+    which the hand has to close in a dozen steps in turn; chance opens it as often, and PPO stayed at reaching the cube with an open hand.
     Version 1: a lift is worth more the higher it is, and a grasp is worth something. In version 0 nothing was worth anything between
     reaching the cube and having it 25 mm above the table, and PPO stayed at reaching it.
     Version 0: first release.

@@ -73,6 +73,8 @@ class TaskState:
     """Goal positions (B, 3) [m]."""
     wrench: Mapping[str, Array]
     """Wrench (B, 6) of every sensor, pad frame."""
+    opening: Array
+    """Gap between two pads (B, 1) [m]; (B, 0) without a gripper."""
     joint_speed: Array
     """Joint speeds (B, n) [rad/s]."""
     action: Array

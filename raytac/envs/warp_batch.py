@@ -180,6 +180,7 @@ class WarpBatch:
                 body_speed=self._body_speed,
                 goal=self._goal,
                 wrench=self.wrench,
+                opening=self._gap(),
                 joint_speed=self._state["speed"],
                 action=actions,
                 last_action=last,
@@ -234,15 +235,18 @@ class WarpBatch:
 
     def _observe(self) -> dict[str, torch.Tensor]:
         """Observations of all environments, float32 and images of 8 bit."""
-        fingers = self._state["fingers"]
-        opening = fingers.sum(1, keepdim=True) if self._control.has_grip else fingers[:, :0]
-        result = state_and_goal(self._tool, self.start_tool, self._turn, self._speed, opening, self._action, self._goal)
+        result = state_and_goal(self._tool, self.start_tool, self._turn, self._speed, self._gap(), self._action, self._goal)
         self.body_observation = body_from_tool(self._tool, self._body, self._body_speed)
         if self.body_seen:
             result["body"] = self.body_observation
         if self.touch is not None:
             result |= self.touch.observe()
         return result
+
+    def _gap(self) -> torch.Tensor:
+        """Gap between two pads (B, 1) [m]; (B, 0) without a gripper."""
+        fingers = self._state["fingers"]
+        return fingers.sum(1, keepdim=True) if self._control.has_grip else fingers[:, :0]
 
     def _body_now(self) -> torch.Tensor:
         return self._state["bodies"][:, self._body_at]

@@ -65,7 +65,7 @@ def states(kind: type[Task], seed: int = 0) -> TaskState:
     return TaskState(
         tool=poses(tool), speed=rng.normal(0.0, 0.1, (ROWS, 3)), body=poses(body), body_speed=rng.normal(0.0, 0.1, (ROWS, 6)),
         goal=goal + off * rng.normal(0.0, 1.0, (ROWS, 3)), wrench={name: wrench() for name in ("sensor", "left", "right")},
-        joint_speed=rng.normal(0.0, 0.5, (ROWS, 7)), action=rng.uniform(-1, 1, (ROWS, size)),
+        opening=rng.uniform(0.0, 0.09, (ROWS, 1)), joint_speed=rng.normal(0.0, 0.5, (ROWS, 7)), action=rng.uniform(-1, 1, (ROWS, size)),
         last_action=rng.uniform(-1, 1, (ROWS, size)),
     )  # fmt: skip
 
