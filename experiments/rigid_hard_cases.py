@@ -3,7 +3,7 @@
     python experiments/rigid_hard_cases.py --out runs/rigid_hard                       # the quick set
     python experiments/rigid_hard_cases.py --cases "drop_50g*,pin" --out runs/rigid_hard_some
     python experiments/rigid_hard_cases.py --full --out runs/rigid_hard_full           # all combinations, 10,000 grasps; resumes
-    python experiments/rigid_hard_cases.py --full --cases "grasps_*" --processes 16 --out runs/grasps      # a part of it, on 16 cores
+    python experiments/rigid_hard_cases.py --full --cases "grasps_coin*" --out runs/coin      # a part of it, for one of several processes
 
 Every case makes three checks beside its own: no environment fails, no body passes the face that the gel is bonded to (its underside over
 the pad, at every sub-step), and the friction of MuJoCo's contacts of the gel stays within 1 % of its cone. The others, with their bounds:
@@ -28,11 +28,9 @@ import re
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +50,6 @@ from experiments.rigid_hard_bench import (
     within_grip,
 )
 from experiments.running import resumed, run, store
-from raytac.checks import check_whole
 from raytac.device import resolve_device
 from raytac.errors import InputError, RaytacError
 from raytac.io import CommonOptions, FolderLock, Metric, versions, write_metrics
@@ -85,8 +82,6 @@ class Args(CommonOptions):
     """Every speed, step and friction coefficient, and 10,000 random grasps."""
     grasps: int = 0
     """Number of random grasps; 0: 48, with ``--full`` 10,000."""
-    processes: int = 1
-    """Processes that cases are spread over; give each one thread (``OMP_NUM_THREADS=1``)."""
     seconds: float = 1.0
     """Factor of every time that something is held; below 1 the bounds mean less."""
 
@@ -97,7 +92,6 @@ def main(args: Args) -> dict[str, Metric]:
         raise InputError("seconds", value=args.seconds, rule="must be greater than 0 and at most 1")
     if args.grasps < 0:
         raise InputError("grasps", value=args.grasps, rule="must be 0 or more")
-    check_whole("processes", args.processes)
     start, cases = time.perf_counter(), all_cases(args)
     patterns = [p.strip() for p in args.cases.split(",") if p.strip()] or ["*"]
     for pattern in patterns:
@@ -109,12 +103,10 @@ def main(args: Args) -> dict[str, Metric]:
     with FolderLock(out):
         rows = {row["case"]: row for row in resumed(out / "cases.json", settings)}
         for name in names:
-            if name in rows:
-                print(line(rows[name]), flush=True)
-        for row in all_measured([name for name in names if name not in rows], cases, args):
-            rows[row["case"]] = row
-            store(out / "cases.json", settings, list(rows.values()))
-            print(line(row), flush=True)
+            if name not in rows:
+                rows[name] = measured(name, cases[name])
+                store(out / "cases.json", settings, list(rows.values()))
+            print(line(rows[name]), flush=True)
         done = [rows[name] for name in names]
         agreements = agreement(done)
         for row in agreements:
@@ -130,21 +122,6 @@ def main(args: Args) -> dict[str, Metric]:
         write_metrics(out / "metrics.json", common | metrics | {"wall_s": time.perf_counter() - start})
     print(f"{metrics['rigid_hard.passed']} of {metrics['rigid_hard.total']} cases pass; written: {out}")
     return metrics
-
-
-def all_measured(names: list[str], cases: Mapping[str, Callable[[], Outcome]], args: Args) -> Iterator[Row]:
-    """Rows as they are done."""
-    if args.processes == 1:
-        yield from (measured(name, cases[name]) for name in names)
-        return
-    with ProcessPoolExecutor(args.processes, get_context("spawn")) as pool:
-        for row in as_completed([pool.submit(one_measured, name, args) for name in names]):
-            yield row.result()
-
-
-def one_measured(name: str, args: Args) -> Row:
-    """The row of one case, in a process of its own."""
-    return measured(name, all_cases(args)[name])
 
 
 def measured(name: str, case: Callable[[], Outcome]) -> Row:
