@@ -266,7 +266,7 @@ def test_a_held_cube_is_worth_more_the_higher_it_is_and_a_loose_one_nothing() ->
     state = TaskState(
         tool=poses, speed=np.zeros((rows, 3)), body=poses, body_speed=np.zeros((rows, 6)),
         goal=np.full((rows, 3), [0.0, 0.0, 0.08]), wrench={"left": wrench, "right": np.tile([0.0, 0, -1, 0, 0, 0], (rows, 1))},
-        opening=np.array([[0.09], [0.08], [0.055], [0.03], [0.029], [0.03]]), joint_speed=np.zeros((rows, 7)),
+        opening=np.array([[0.09], [0.05], [0.04], [0.03], [0.029], [0.03]]), joint_speed=np.zeros((rows, 7)),
         action=np.zeros((rows, 4)), last_action=np.zeros((rows, 4)),
     )  # fmt: skip
     terms = LiftCube().evaluate(state).terms
