@@ -59,6 +59,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "physics/test_soft_scene.py",
         "regression",
         "test_sensor_soft.py",
+        "test_threads.py",
         "test_warp_runtime.py",
         "world/engine",
         "world/test_held.py",
