@@ -4,6 +4,7 @@
     python experiments/bench_rl.py --envs 16 --modes fots,table32 --steps 40
     git worktree add ../raytac_b682ef2 b682ef2; python experiments/bench_rl.py --against ../raytac_b682ef2 --out runs/bench_rl_against
     python experiments/bench_rl.py --envs 4096 --modes none,fots,table32 --device cuda --out runs/bench_rl_warp
+    python experiments/bench_rl.py --envs 4096 --modes fots --device cuda --gpus 2 --out runs/bench_rl_two
     python experiments/bench_rl.py --frames --envs 512 --device cuda --out runs/bench_rl_cuda
 
 Modes: ``none`` (no touch), ``fots`` (9 x 11 marker displacements), ``touch`` (these and the wrench), ``table32`` (32 x 32 images of the
@@ -40,7 +41,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.running import recorded, run
-from raytac.checks import check_known
+from raytac.checks import check_known, check_whole
 from raytac.device import resolve_device
 from raytac.envs import PushCubeVectorEnv
 from raytac.errors import InputError, RaytacError
@@ -91,6 +92,8 @@ class Args(CommonOptions):
     """``mujoco``: worlds on the CPU, images on ``--device``; ``mujoco_warp``: all on ``--device``; ``auto``: the latter on CUDA."""
     launches: int | None = None
     """Steps of MuJoCo Warp in a control step, as many as the scene's if not given. Of more a world divides one where something is fast."""
+    gpus: int = 1
+    """GPUs of this machine with so many environments each, in a process of its own each, with the engine ``mujoco_warp``."""
     against: Path | None = None
     """Checkout of another commit to take turns with."""
     rounds: int = 3
@@ -105,6 +108,7 @@ def main(args: Args) -> dict[str, Metric]:
     names = parse_names(args.modes or ",".join(FRAMES if args.frames else TIMED), "modes", known)
     device = resolve_device(args.device)
     check_known("engine", args.engine, ENGINES)
+    check_whole("gpus", args.gpus)
     on_device = args.engine == "mujoco_warp" or (args.engine == "auto" and device == "cuda" and not args.frames)
     parse_resolution(args.size)
     with recorded(args, "bench_rl", device=device, owned=("metrics.json",), packages=("gymnasium",)) as (_, metrics):
@@ -116,7 +120,8 @@ def main(args: Args) -> dict[str, Metric]:
                 print(f"{name}: {metrics[f'{where}.{name}.frames_per_s']:.0f} frames/s")
             else:
                 where, run_mode = ("gpu." if device == "cuda" else "warp.", timed_on_device) if on_device else ("", timed)
-                metrics |= {f"{where}push.{name}.{key}": value for key, value in run_mode(MODES[name], args).items()}
+                found = timed_on_gpus(name, args) if args.gpus > 1 else run_mode(MODES[name], args)
+                metrics |= {f"{where}push.{name}.{key}": value for key, value in found.items()}
                 print(f"{name}: {metrics[f'{where}push.{name}.env_steps_per_s']:.0f} environment steps/s", flush=True)
     return metrics
 
@@ -233,20 +238,20 @@ def timed_on_device(tactile: ObservationSettings | None, args: Args) -> dict[str
     pressed, failed = (torch.zeros((), dtype=torch.float64, device=batch.device) for _ in range(2))
 
     def step() -> None:
-        """One step of all environments, with the policy of ``timed``."""
+        """One step of all environments, with the policy of ``timed``; it presses with about 2 N."""
         nonlocal observation
         action = torch.cat([v.reshape(len(v), -1) / (255 if v.dtype == torch.uint8 else 1) for v in observation.values()], dim=1)
         for weight in weights:
             action = torch.tanh(action @ weight)
         force = -batch.wrench["sensor"][:, 2]
         action[:, :2] *= 0.1
-        action[:, 2] = (0.3 * (force - 1.0)).clamp(-1.0, 1.0)
+        action[:, 2] = (0.3 * (force - 2.0)).clamp(-1.0, 1.0)
         result = batch.step(action)
         observation = result.observation
         pressed.add_((force > 0.0).double().mean())
         failed.add_(result.failed.sum())
 
-    for _ in range(args.steps // 3):
+    for _ in range(max(args.steps // 3, 30)):  # until the pads are down
         step()
     batch.check()
     prepared = time.perf_counter() - begin
@@ -264,6 +269,26 @@ def timed_on_device(tactile: ObservationSettings | None, args: Args) -> dict[str
         "failed": int(failed),
         "prepared_s": prepared,
     }
+
+
+def timed_on_gpus(mode: str, args: Args) -> dict[str, Metric]:
+    """Keys of one mode in a process for each GPU, at the same time: the sum of the steps a second, and the least and the most of them."""
+    with tempfile.TemporaryDirectory() as out:
+        sizes = ["--envs", str(args.envs), "--steps", str(args.steps), "--seed", str(args.seed), "--device", "cuda"]
+        sizes += [] if args.launches is None else ["--launches", str(args.launches)]
+        running = []
+        for k in range(args.gpus):
+            command = [sys.executable, __file__, "--modes", mode, *sizes, "--out", str(Path(out, str(k)))]
+            own = {**os.environ, "CUDA_VISIBLE_DEVICES": str(k), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+            running.append(subprocess.Popen(command, env=own, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True))
+        for one in running:
+            text = one.communicate()[0]
+            if one.returncode:
+                raise RaytacError(f"{mode} ended with {one.returncode}: {(text.strip() or 'no message').splitlines()[-1]}")
+        rows = [read_metrics(Path(out, str(k), "metrics.json")) for k in range(args.gpus)]
+    speeds = [float(row[f"gpu.push.{mode}.env_steps_per_s"]) for row in rows]
+    pressed = min(float(row[f"gpu.push.{mode}.pressed"]) for row in rows)
+    return {"env_steps_per_s": sum(speeds), "least": min(speeds), "most": max(speeds), "pressed": pressed, "gpus": args.gpus}
 
 
 def frames(optics: str, args: Args) -> dict[str, Metric]:

@@ -104,6 +104,7 @@ def test_markers_are_those_of_the_host() -> None:
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_episodes_that_end_begin_again_and_leave_the_others_to_the_bit(device: str) -> None:
+    """On CUDA to rounding: MuJoCo Warp's list of contacts, and so the order of sums, differs from run to run there."""
     one, other = (
         WarpBatch(PushCube(), num_envs=3, tactile=("markers", "wrench"), device=device, seed=1, max_episode_steps=50)
         for _ in range(2)
@@ -117,7 +118,8 @@ def test_episodes_that_end_begin_again_and_leave_the_others_to_the_bit(device: s
         a, b = one.step(actions), other.step(actions)
         assert b.truncated.tolist() == [False, step == 4, False]
         for name, values in a.observation.items():
-            assert torch.equal(values[[0, 2]], b.observation[name][[0, 2]]), name
+            tolerance = 0.0 if device == "cpu" else 1e-4
+            torch.testing.assert_close(values[[0, 2]], b.observation[name][[0, 2]], rtol=0.0, atol=tolerance, msg=name)
     assert other.steps.tolist() == [8, 3, 8] and not torch.equal(a.observation["state"][1], b.observation["state"][1])
 
 
@@ -176,3 +178,31 @@ def test_what_is_not_on_the_device_is_refused() -> None:
     batch.reset()
     with pytest.raises(InputError, match="actions"):
         batch.step(torch.zeros(2, 3))
+
+
+@pytest.mark.gpu
+@pytest.mark.slow
+@pytest.mark.parametrize("task", [PushCube, BalancePole, LiftCube, RollBall])
+def test_a_million_random_steps_stay_finite_and_bounded(task: type[Task]) -> None:
+    """Environments that fail are marked and begin again; nothing that is observed grows."""
+    batch = WarpBatch(task(), num_envs=2048, tactile=("markers", "wrench"), device="cuda", contacts=40, rows=200)
+    batch.reset(0)
+    generator = torch.Generator(batch.device).manual_seed(0)
+    steps, failed = 490, torch.zeros((), device=batch.device)
+    halves = []
+    greatest = torch.zeros((), device=batch.device)
+    sound = torch.ones((), dtype=torch.bool, device=batch.device)
+    for k in range(steps):
+        actions = 2.0 * torch.rand(2048, batch.size, generator=generator, device=batch.device) - 1.0
+        result = batch.step(actions)
+        values = torch.cat([array.reshape(2048, -1) for array in result.observation.values()], dim=1)
+        sound &= torch.isfinite(values).all() & torch.isfinite(result.reward).all()
+        greatest = torch.maximum(greatest, values.abs().max())
+        failed += result.failed.sum()
+        if k in (steps // 2, steps - 1):
+            halves.append(float(greatest))
+            greatest.zero_()
+    batch.check()
+    assert bool(sound) and 2048 * steps > 1_000_000
+    assert float(failed) < 1e-3 * 2048 * steps, f"{float(failed)} failed"
+    assert halves[1] < 3.0 * halves[0] < 1e3, halves
