@@ -34,7 +34,7 @@ CUDA_MINIMUM = (12, 2)
 CUDA_REFUSED = (12, 7)
 """CUDA whose OptiX Dr.Jit 1.5 refuses."""
 LLVM_NAMED_BY_USER = bool(os.environ.get("DRJIT_LIBLLVM_PATH"))
-"""True if the environment named a libLLVM before raytac started; else ``raytac.optics``, which imports this first, names one."""
+"""True if the environment named a libLLVM at the start; else ``raytac.optics`` names one."""
 LLVM_MINIMUM = 16
 """Oldest LLVM looked for: Dr.Jit 1.5 refuses 14, and 15 was seen to abort the process."""
 
@@ -80,10 +80,7 @@ def cuda_missing(ray_tracing: bool = True) -> str:
 
 @functools.cache
 def cuda_device_count() -> int:
-    """Number of CUDA devices that the driver shows this process; 0 without a driver.
-
-    Creates no CUDA context.
-    """
+    """Number of CUDA devices that the driver shows this process; creates no CUDA context."""
     driver = _load(("nvcuda.dll",) if sys.platform == "win32" else ("libcuda.so.1", "libcuda.so"))
     if driver is None or driver.cuInit(0) != 0:
         return 0
@@ -102,10 +99,7 @@ def cuda_driver_version() -> tuple[int, int]:
 
 @functools.cache
 def total_memory(device: str) -> int:
-    """Memory [byte] of the machine (``"cpu"``) or of the first CUDA device (``"cuda"``).
-
-    Whoever uses it. Creates no CUDA context.
-    """
+    """Memory [byte] of the machine or of the first CUDA device, used or not; creates no context."""
     if device == "cpu":
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     driver, handle, size = _load(("nvcuda.dll", "libcuda.so.1", "libcuda.so")), ctypes.c_int(0), ctypes.c_size_t(0)
@@ -118,10 +112,7 @@ def total_memory(device: str) -> int:
 
 @functools.cache
 def optix_library() -> str | None:
-    """Name of the OptiX library that can be loaded, or None.
-
-    ``DRJIT_LIBOPTIX_PATH`` wins, as in Dr.Jit.
-    """
+    """Name of the OptiX library that can be loaded, or None; ``DRJIT_LIBOPTIX_PATH`` wins."""
     name = os.environ.get("DRJIT_LIBOPTIX_PATH") or ("nvoptix.dll" if sys.platform == "win32" else "libnvoptix.so.1")
     return name if _load((name,)) is not None else None
 

@@ -1,9 +1,7 @@
 """``raytac doctor``: try what the jobs need, and say what will be used and how to mend it.
 
-Each trial is a process of its own.
-
-A library that aborts (LLVM 15 does, inside Dr.Jit, on some machines) takes its process down before Python can say a word; here it
-takes down only its probe.
+Each trial is a process of its own. A library that aborts (LLVM 15 does, inside Dr.Jit, on some machines) takes its process down
+before Python can say a word; here it takes down only its probe.
 """
 
 from __future__ import annotations
@@ -111,7 +109,7 @@ print("jinja2", jinja2.__version__, "pyarrow", pyarrow.__version__, "scikit-imag
 
 _DENOISER = """
 import numpy as np
-from raytac.optics.trace.denoise import make_denoiser
+from raytac.optics.trace.sampled_tracer import make_denoiser
 from raytac.optics.runtime import load_mitsuba
 mi, device = load_mitsuba()
 grey = np.full((32, 32, 3), 0.5, np.float32)

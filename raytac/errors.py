@@ -33,10 +33,7 @@ _LONGEST_WORD = 100
 
 
 class RaytacError(Exception):
-    """Base of every error that raytac raises on purpose.
-
-    The message is one bounded text, whatever value it is about.
-    """
+    """Base of every error that raytac raises on purpose; its message is one bounded text."""
 
     def __str__(self) -> str:
         text = super().__str__()
@@ -51,10 +48,7 @@ class AssetError(RaytacError, FileNotFoundError):
 
 
 class BackendError(RaytacError, RuntimeError):
-    """A renderer, solver or device that the job needs is missing or does not work here.
-
-    The message says how to mend it.
-    """
+    """A renderer, solver or device is missing or does not work; the message says how to mend it."""
 
 
 class InputError(RaytacError, ValueError):
@@ -100,7 +94,7 @@ class SpecError(RaytacError, ValueError):
         choices: Iterable[object] = (),
         hint_for: str | None = None,
     ) -> None:
-        """``hint_for`` is the word to find a close match for among ``choices`` (default: ``value`` when it is a string)."""
+        """``hint_for``: word to match among ``choices`` (default: a ``value`` that is a string)."""
         self.file = Path(file) if file is not None else None
         self.key = key
         self.value = value
@@ -113,10 +107,7 @@ class SpecError(RaytacError, ValueError):
 
 
 class CalibrationError(SpecError):
-    """A calibration folder cannot be used.
-
-    A file is missing, damaged, or holds something of the wrong kind, shape or range.
-    """
+    """A calibration folder with a file that is missing, damaged, or of a wrong kind or shape."""
 
 
 class MeshError(SpecError):
@@ -126,9 +117,8 @@ class MeshError(SpecError):
 def short_repr(value: object, limit: int = 80) -> str:
     """``repr`` cut to ``limit`` characters, for any value.
 
-    A path is plain text, and whole up to ``_LONGEST_PATH`` characters.
-
-    Integers too long to be printed, deep and long containers, and objects whose ``repr`` fails are abbreviated.
+    A path is plain text, and whole up to ``_LONGEST_PATH`` characters. Integers too long to be printed, deep and long containers,
+    and objects whose ``repr`` fails are abbreviated.
     """
     if isinstance(value, Path):
         text = str(value)
@@ -142,10 +132,7 @@ def short_repr(value: object, limit: int = 80) -> str:
 
 
 def _pieces(value: object, limit: int, levels: int) -> Iterator[str]:
-    """``repr`` of ``value`` piece by piece, so that a reader can stop.
-
-    No piece needs more than ``levels`` nested calls.
-    """
+    """``repr`` of ``value`` piece by piece, by at most ``levels`` nested calls."""
     if isinstance(value, (list, tuple, dict)) and type(value).__repr__ in (list.__repr__, tuple.__repr__, dict.__repr__):
         first, last = {list: "[]", tuple: "()", dict: "{}"}[next(t for t in (list, tuple, dict) if isinstance(value, t))]
         yield first

@@ -24,10 +24,7 @@ IMAGES = ("rgb", "layers", "normals", "position", "depth", "contact", "uncovered
 
 
 class MissingOutputError(InputError, AttributeError):
-    """A field of a frame that was not asked for, or cannot be.
-
-    The message says how to ask for it.
-    """
+    """A field of a frame that was not asked for, or cannot be; the message says how to ask."""
 
 
 _ASK = {
@@ -74,40 +71,45 @@ class TactileFrame:
     contact: np.ndarray
     """Contact mask seen by the camera, (B, H, W), bool (comes with ``normals`` or ``depth``)."""
     uncovered: np.ndarray
-    """Share of the contact's pixels whose bin of the Taxim table no calibration sample reached, shape (B,), NaN without contact;
-    of the mode ``taxim`` alone, where the table tells its coverage."""
+    """Share of the contact's pixels whose bin of the Taxim table no sample reached, (B,).
+
+    NaN without contact; of the mode ``taxim`` alone, where the table tells its coverage."""
     markers: MarkerFrame
     """Positions of the markers, in metres and pixels; present if the sensor has a marker model."""
     wrench: np.ndarray
     """Force on the pad [N] and torque about the pad frame's origin [N m], pad frame, (B, 6)."""
     traction: np.ndarray
-    """Force of the object on the pad per area [Pa], pad frame, on the pad grid, shape (B, Ny, Nx, 3), float32: x, y shear, −z pressure.
-    Of a soft pad at the place that the coat has at rest; of the rigid pad its force shared out over the contact (a model). Its sum
-    over the nodes, each times its area (``raytac.gel.traction.cell_areas``: half a cell at the pad's edge), is the wrench's force."""
+    """Force on the pad per area [Pa], (B, Ny, Nx, 3), float32: x, y shear, −z pressure.
+
+    Pad frame, on the pad grid. Of a soft pad at the place that the coat has at rest; of the rigid pad its force shared out over the
+    contact (a model). Its sum over the nodes, each times its area (``raytac.gel.traction.cell_areas``: half a cell at the pad's edge), is
+    the wrench's force."""
     contact_area: np.ndarray
     """Area of ``surface.contact`` [m²], shape (B,) (comes with ``wrench`` or ``traction``)."""
     contact_cells: np.ndarray
-    """Width of the narrowest patch of contact in cells of a soft pad, shape (B,), NaN without contact (comes with ``wrench`` or
-    ``traction``): with fewer than 6 the force at a given depth is too large."""
+    """Width of the narrowest patch of contact in cells of a soft pad, (B,); NaN without contact.
+
+    With fewer than 6 the force at a given depth is too large. Comes with ``wrench`` or ``traction``."""
     force: np.ndarray
     """Force of the object on the pad, pad frame [N], shape (B, 3); not of a bare surface."""
     force_law_area: np.ndarray
-    """Area of contact in the law that ties force to depth [m²], shape (B,); not that of ``surface.contact``. Of the rigid
-    pad's presses."""
+    """Area in the load law of a rigid press [m²], (B,); not that of ``surface.contact``."""
     failed: np.ndarray
     """Environments whose physics broke down, shape (B,), bool; their arrays hold nothing of use."""
     unconverged: np.ndarray
-    """Steps of a soft pad's solver that did not meet its tolerance since the press began, or since the world's environment was reset,
-    shape (B,), int. An environment whose last step is one of them has ``failed``."""
+    """Steps of a soft pad's solver that missed its tolerance since press or reset, (B,), int.
+
+    An environment whose last step is one of them has ``failed``."""
     time_ms: dict[str, float]
-    """Wall time of ``physics``, ``surface``, ``markers``, ``optics`` for the batch [ms]. ``optics`` is the time to launch the images and,
-    once one was read, the time that was waited for them."""
+    """Wall time of ``physics``, ``surface``, ``markers``, ``optics`` for the batch [ms].
+
+    ``optics`` is the time to launch the images and, once one was read, the wait for them."""
 
     label: str
     """Physics and optics that it came from, as ``TactileSensor.label``; empty if unknown."""
 
     def __init__(self, surface: GelSurface, *, images: Callable[[], Mapping[str, Any]] | None = None, **values: Any) -> None:
-        """``values``: further fields; None is as if it were not given. ``images``: a function that waits for those of ``IMAGES``."""
+        """``values``: further fields, None as not given; ``images`` waits for those of ``IMAGES``."""
         known = [f.name for f in fields(type(self))]
         for name in values:
             if name not in known:

@@ -1,7 +1,4 @@
-"""A check that ``import ipc`` means raytac's own solver.
-
-Other packages of that name can be installed.
-"""
+"""A check that ``import ipc`` means raytac's own solver, not another package of that name."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ class Registry(Generic[Config]):
     """
 
     def __init__(self, argument: str, built_in: Mapping[str, str]) -> None:
-        """``argument``: what users call this axis, for error messages; ``built_in``: ``module:Class`` of each name."""
+        """``argument``: name of this axis in errors; ``built_in``: ``module:Class`` of each name."""
         self.argument = argument
         self._classes: dict[str, str | type[Config]] = dict(built_in)
 
@@ -29,11 +29,7 @@ class Registry(Generic[Config]):
         return tuple(self._classes)
 
     def register(self, name: str) -> Callable[[type[Any]], type[Any]]:
-        """Class decorator that makes a configuration known by a name.
-
-        Raises:
-            InputError: the name is taken by another class.
-        """
+        """Class decorator: make a configuration known by a name; ``InputError`` if taken."""
 
         def add(config: type[Any]) -> type[Any]:
             taken = self._classes.get(name)
@@ -45,11 +41,7 @@ class Registry(Generic[Config]):
         return add
 
     def config_class(self, name: str) -> type[Config]:
-        """Class that configures the implementation of a name.
-
-        Raises:
-            InputError: an unknown name; the message lists all.
-        """
+        """Class that configures the implementation of a name; ``InputError`` lists the names."""
         if not isinstance(name, str) or name not in self._classes:
             raise InputError(self.argument, value=name, rule="must be a known name", choices=self.names)
         entry: Any = self._classes[name]
@@ -59,11 +51,7 @@ class Registry(Generic[Config]):
         return entry
 
     def config(self, choice: str | Config, **options: Any) -> Config:
-        """Configuration of a name, with ``options`` as its fields, or the configuration itself.
-
-        Raises:
-            InputError: an unknown name or field, or a value that the configuration refuses.
-        """
+        """Configuration of a name with ``options``, or itself; ``InputError`` for what it refuses."""
         if not isinstance(choice, str):
             return choice
         config = self.config_class(choice)
@@ -74,7 +62,7 @@ class Registry(Generic[Config]):
         return config(**options)
 
     def name_of(self, config: Config) -> str:
-        """Name under which the class of a configuration is registered; the class's own name if it is not."""
+        """Name that the class of a configuration is registered by; the class's own otherwise."""
         for name in self.names:
             entry = self._classes[name]
             if isinstance(entry, str):

@@ -1,21 +1,34 @@
-"""Warp for the package's own kernels: its start, and launches that are recorded as one graph, on the CPU and on CUDA."""
+"""Warp for the package's kernels: its start, and launches recorded as one graph."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from threading import Lock
+from threading import RLock
 from typing import Any
 
 import warp as wp
 
 from raytac.installation import foreign_ipc
 
-LAUNCH = Lock()
-"""Held by a launch of kernels with tiles. On a CPU Warp keeps these in one place of the process, where two threads would meet."""
+
+def _shared_lock() -> Any:
+    """The solver's lock of launches; where another package hides ``ipc``, there are no launches of its own."""
+    if foreign_ipc() is not None:
+        return RLock()
+    from ipc.warp_start import LAUNCH as SHARED
+
+    return SHARED
+
+
+LAUNCH = _shared_lock()
+"""Held by recordings, and by launches that are recorded or have tiles.
+
+On the CPU Warp has one recording and one place for tiles a process, where threads would meet.
+"""
 
 
 def start_warp() -> None:
-    """``wp.init()``, with a temporary folder for compiled kernels where the user's cannot be written; ``ipc`` warns then.
+    """``wp.init()``; kernels go to a temporary folder where the user's cannot be written.
 
     Where another package hides ``ipc``, Warp takes the user's folder as it is.
     """
@@ -27,13 +40,13 @@ def start_warp() -> None:
 
 
 class Recorded:
-    """Kernels that are always launched together, with the same arguments: repeating all costs less than one launch."""
+    """Kernels that are always launched together: repeating all costs less than one launch."""
 
     def __init__(self, *launches: Callable[[], object], device: Any = "cpu") -> None:
-        """Record what functions launch; it does not run. Of the arrays of a launch they must hold a reference, as a ``partial`` does."""
+        """Record what functions launch; they must hold its arrays, as a ``partial`` does."""
         start_warp()
         self._launches = launches  # the graph itself keeps no array alive
-        with wp.ScopedCapture(device=device) as capture:
+        with LAUNCH, wp.ScopedCapture(device=device) as capture:
             for launch in launches:
                 launch()
         self._graph: Any = capture.graph

@@ -181,10 +181,7 @@ def add_pair(
     pair: wp.vec3i,
     candidates: Candidates,
 ):
-    """Adds two edges (``ee``) or a vertex and a face if their boxes overlap, but for neighbours.
-
-    ``lo`` to ``hi`` is the box of the first.
-    """
+    """Adds edges (``ee``) or vertex and face if their boxes (``lo``, ``hi``: first's) overlap."""
     lo2, hi2 = prim_box(boxes, surface, env, 2 - wp.int32(ee), pair[1])
     if not overlap(lo, hi, lo2, hi2, surface.d_hat):
         return
@@ -242,10 +239,7 @@ def find_pairs(
     # outputs
     candidates: Candidates,
 ):
-    """Edges (``ee``) or vertices of list ``first`` against edges or faces of list ``second``.
-
-    Within one list each pair is looked at once.
-    """
+    """Edges (``ee``) or vertices of list ``first`` with those or faces of ``second``, once each."""
     env, i = wp.tid()
     if stale[env] == 0 or i >= list_count[env, first]:
         return

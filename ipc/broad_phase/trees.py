@@ -231,10 +231,7 @@ class Trees:
         self._edges = _Side(_EDGES, layout, [(a, b, i) for i, a, b in pairs], batch, device)
 
     def find(self, boxes: Boxes, surface: Surface, vert_body: wp.array, stale: wp.array, candidates: Candidates) -> None:
-        """Add the pairs of environments of the mask ``stale`` (B,), without allocation or wait.
-
-        ``vert_body`` (V,) is the body of each vertex.
-        """
+        """Add pairs of environments in ``stale`` (B,), without a wait; ``vert_body`` (V,): bodies."""
         for side in (self._faces, self._edges):
             side.refit(boxes, surface, stale)
             inputs = [boxes, surface, vert_body, side.kind == _EDGES, side.tree, side.partners, stale]

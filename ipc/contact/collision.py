@@ -233,10 +233,7 @@ class Collision:
         gradient: wp.array,
         energy: wp.array,
     ) -> None:
-        """Contacts, rows, ``gradient`` (B, V) [N] and ``energy`` (B,) [J] of barrier and friction.
-
-        What does not fit sets ``overflow``.
-        """
+        """Contacts, rows, ``gradient`` (B, V) [N], ``energy`` (B,) [J]; sets ``overflow``."""
         outputs = [gradient, energy, self.contacts]
         self._launch(contacts.clear, x.shape, [active], outputs)
         if self._meshes:

@@ -214,11 +214,7 @@ def find_overlap(layout: Layout, x: Floats, normal: Floats, origin: Floats) -> s
 
 
 def check_overlap(layout: Layout, state: State, mask: NDArray[np.bool_]) -> None:
-    """Refuse surfaces that cross in the environments of the mask; equal ones are checked once.
-
-    Raises:
-        OverlapError: names the environment and the surfaces.
-    """
+    """Refuse surfaces that cross in the mask's environments (equal ones once): OverlapError."""
     seen: set[bytes] = set()
     for env in np.flatnonzero(mask):
         key = state.y[env].tobytes() + state.frame_rotation[env].tobytes() + state.frame_position[env].tobytes()

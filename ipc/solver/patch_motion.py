@@ -35,11 +35,7 @@ class RestPatches:
     """Patches of one bonded soft body; making it inverts the body's rest matrix once."""
 
     def __init__(self, layout: Layout, settings: Settings, body: int) -> None:
-        """Invert the body's rest matrix.
-
-        Raises:
-            IpcError: the body is too large for it, or the matrix too ill-conditioned for single precision.
-        """
+        """Invert the body's rest matrix; ``IpcError`` if too large or too ill-conditioned."""
         nodes, label = choose_partition(layout, body)
         name, size = layout.names[body], entries(layout, nodes, label)
         if size > MAX_ENTRIES:

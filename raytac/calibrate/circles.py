@@ -75,10 +75,7 @@ def with_found_circles(presses: RealPresses, pixel_pitch: float) -> tuple[RealPr
 
 
 def circle_score(change: np.ndarray, circles: np.ndarray) -> np.ndarray:
-    """Mean colour step [levels] across each of ``circles`` (N, 3) in ``change`` (H, W, 3).
-
-    −1 where too little of a circle is in the image.
-    """
+    """Mean colour step [levels] across ``circles`` (N, 3) in ``change``; −1 off the image."""
     x, y, r = np.asarray(circles, dtype=float).T[..., None]
     angle = 2 * np.pi * np.arange(_ANGLES) / _ANGLES
     sides, valid = [], True
@@ -118,10 +115,7 @@ def _climb(change: np.ndarray, circle: np.ndarray, limit: float) -> tuple[np.nda
 
 
 def _sample(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bilinear values at pixel positions, and a mask of those in the image.
-
-    The first pixel's centre is at 0.5.
-    """
+    """Bilinear values at pixel positions (first centre at 0.5); a mask of those in the image."""
     height, width = image.shape[:2]
     x, y = u - 0.5, v - 0.5
     inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)

@@ -1,6 +1,6 @@
 """Direct light of point LEDs on a Lambertian coat, with derivatives, in NumPy for fits.
 
-It is the diffuse part of the ray tracer's own sum (``raytac.optics.trace.direct``) with one point an LED and no visibility:
+It is the diffuse part of the ray tracer's own sum (``raytac.optics.trace.fast_tracer``) with one point an LED and no visibility:
 
     D = c^n · cos θ · d₀² / r²,  c = −w · a,  cos θ = w · n_p,  w = (l − p) / r,
 
@@ -66,10 +66,7 @@ def led_light(seen: PixelGeometry, led: np.ndarray, reference: float) -> LedLigh
 
 
 def case_light(seen: PixelGeometry) -> np.ndarray:
-    """Irradiance (M,) of a case of even radiance 1 / π on the coat, (1 − n_z) / 2.
-
-    It is the share of the hemisphere that lies below the pad.
-    """
+    """Irradiance (M,) of a case of radiance 1 / π: its share of the hemisphere, (1 − n_z) / 2."""
     return 0.5 * (1 - seen.n[2])
 
 

@@ -20,9 +20,9 @@ from raytac.gel.surface import GelSurface, make_grid
 from raytac.optics.image.config import Phong
 from raytac.optics.image.mlp_weights import INPUTS, LEVELS, MlpWeights, inputs, view_size, view_slope
 from raytac.optics.response import fit_log_gain
-from raytac.optics.taxim.bake.bake import PLAIN, bake_shadow
 from raytac.optics.taxim.bake.fit import BinSums, two_sheets
-from raytac.optics.taxim.bake.settings import BakeSettings
+from raytac.optics.taxim.bake.settings import PLAIN, BakeSettings
+from raytac.optics.taxim.bake.shadow import bake_shadow
 from raytac.optics.taxim.bake.views import Calibration
 from raytac.optics.taxim.table import PolyTable, slope_bins
 from raytac.optics.trace.config import RayTraced
@@ -189,10 +189,7 @@ def fit_mlp(
     settings: MlpSettings = MlpSettings(),
     tick: Callable[[int], None] | None = None,
 ) -> MlpWeights:
-    """Network of ``samples`` over the real ``background`` (H, W, 3) [levels].
-
-    ``tick`` is called with the number of passes done so far.
-    """
+    """Network of ``samples`` over ``background`` (H, W, 3) [levels]; ``tick`` counts passes."""
     rng = np.random.default_rng(seed)
     height, width = background.shape[:2]
     chosen = rng.permutation(len(samples.row))[: settings.samples]

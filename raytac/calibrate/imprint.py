@@ -30,10 +30,7 @@ _TABLE = np.linspace(0, KNOTS[-1], 751)
 
 @dataclass(frozen=True)
 class PixelGeometry:
-    """Coat that pixels see, pad frame: points ``p`` [m] and normals ``n``, each (3, M).
-
-    Normals point towards the camera.
-    """
+    """Coat in pixels, pad frame: points ``p`` [m], normals ``n`` to the camera, each (3, M)."""
 
     p: np.ndarray
     n: np.ndarray

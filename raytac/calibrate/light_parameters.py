@@ -54,10 +54,7 @@ class LightParameters:
 
     @classmethod
     def of(cls, sensor: SensorSpec, background: np.ndarray) -> LightParameters:
-        """Parameters of a sensor, whose image at rest is ``background`` [levels].
-
-        InputError for a layer that is no camera channel.
-        """
+        """Parameters of a sensor with this image at rest [levels]; InputError for other layers."""
         leds, power = [], []
         for led in sensor.lights.leds:
             if led.layer not in CHANNELS:
@@ -109,10 +106,7 @@ def full_scale(sensor: SensorSpec) -> np.ndarray:
 
 
 def with_parameters(sensor: SensorSpec, p: LightParameters, background: np.ndarray) -> SensorSpec:
-    """The sensor with fitted lights and response, without colour shading, not checked.
-
-    ``background`` as of ``LightParameters.of``.
-    """
+    """The sensor with fitted lights and response, unchecked; ``background`` as of ``of``."""
     gamma, *stray, a1, a2 = map(float, p.response)
     black = np.array(stray) * darkest(background, gamma)
     black_level = tuple(map(float, black))
@@ -194,10 +188,7 @@ LEAST = 1.0
 
 @dataclass(frozen=True)
 class Ties:
-    """Beliefs about a fit's vector x: ``matrix`` x is about ``offset``, (T, n) and (T,).
-
-    Both are in standard deviations.
-    """
+    """Beliefs, in standard deviations: ``matrix`` x is about ``offset``, (T, n) and (T,)."""
 
     matrix: np.ndarray
     offset: np.ndarray

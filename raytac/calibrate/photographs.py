@@ -91,8 +91,5 @@ def photographs_of(presses: RealPresses, sensor: SensorSpec) -> Photographs:
 
 
 def read_photographs(data: Path, sensor: SensorSpec) -> Photographs:
-    """``photographs_of`` the presses of a data set that labels its circles.
-
-    Raises as that and ``read_presses``.
-    """
+    """``photographs_of`` the presses of a data set with labelled circles; as ``read_presses``."""
     return photographs_of(read_presses(data), sensor)

@@ -225,10 +225,7 @@ def by_press(count: int, folds: int) -> list[Split]:
 
 
 def by_half(presses: RealPresses) -> list[Split]:
-    """Splits from the left half of the pad to the right one, and the reverse, by circle.
-
-    Raises InputError for a half without a press.
-    """
+    """Splits from the pad's left half to the right, and back; InputError for an empty half."""
     in_left_half = _known(presses)[:, 0] < presses.resolution[0] / 2
     if in_left_half.all() or not in_left_half.any():
         raise InputError("presses", value=f"{len(presses)} presses", rule="must lie on both halves of the image")

@@ -63,10 +63,7 @@ def brightened(problem: DirectFit, state: FitState) -> FitState:
 
 
 def first_state(sensor: SensorSpec, shots: Photographs, settings: FitSettings, seed: int) -> FitState:
-    """Start of a fit: the sensor's own lights, brightened, and the rigid pad's imprint.
-
-    The imprint lies at the labelled circles.
-    """
+    """Start of a fit: the sensor's lights, brightened; the rigid imprint at labelled circles."""
     begin = FitState(LightParameters.of(sensor, shots.background), RIGID_PAD.copy(), shots.circles.copy())
     return brightened(DirectFit(sensor, shots, begin, settings, factor=FACTOR, seed=seed), begin)
 
@@ -194,10 +191,7 @@ def refine_circles(
     seed: int = 0,
     tracing: RayTraced | None = None,
 ) -> np.ndarray:
-    """Circles (N, 3) [px] of presses that the lights were not fitted to.
-
-    They follow from their labels and the finished lights.
-    """
+    """Circles (N, 3) [px] of presses that were not fitted, from labels and fitted lights."""
     all_fixed = FitSettings(fixed=tuple(SIGMA))
     own = FitState(state.p, state.slopes, shots.circles.copy())
     problem = DirectFit(sensor, shots, own, all_fixed, factor=FACTOR, seed=seed)

@@ -16,22 +16,23 @@ from raytac.specs import load_sensor
 
 @dataclass(frozen=True, kw_only=True)
 class BakeArgs(ShadowOptions, CommonOptions):
-    """Bake a Taxim table from the ray tracer of a sensor: rendered presses of balls and pins, fitted by slope.
+    """Bake a Taxim table from the ray tracer of a sensor.
 
-    Writes the table as a calibration folder that the package taxim reads too (polycalib.npz, dataPack.npz, gelmap.npy, shadowTable.npz,
-    params.json, raytac.npz), coverage.png, sheet.png and metrics.json, and keeps it in the cache, from where optics taxim takes it if it is
-    of the sensor's own resolution and not of --quick. Without --out the folder is runs/bake/SENSOR, with --quick runs/bake/SENSOR-quick.
-    An error or Ctrl-C leaves folder and cache as they were.
+    Presses of balls and pins are rendered and fitted by slope. Writes the table as a calibration folder that the package taxim reads
+    too (polycalib.npz, dataPack.npz, gelmap.npy, shadowTable.npz, params.json, raytac.npz), coverage.png, sheet.png and
+    metrics.json, and keeps it in the cache, from where optics taxim takes it if it is of the sensor's own resolution and not of
+    --quick. Without --out the folder is runs/bake/SENSOR, with --quick runs/bake/SENSOR-quick. An error or Ctrl-C leaves folder and
+    cache as they were.
     """
 
     sensor: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SENSOR")] = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
     resolution: str | None = None
-    """WIDTHxHEIGHT of the table's images in pixels, as in 320x240; the sensor's own if not given."""
+    """WIDTHxHEIGHT of the table's images [px], as in 320x240; the sensor's own if not given."""
     scenes: str = "sphere,coin,pins"
-    """Shipped press scenes or scene files, joined by commas, on which the table is compared with the ray tracer."""
+    """Press scenes, names or files joined by commas, to compare table and ray tracer on."""
     quick: bool = False
-    """Few presses and coarse bins, in seconds: shows that all runs; a poor table, which only --calibration FOLDER uses."""
+    """Few presses, coarse bins, in seconds: a poor table, which only --calibration FOLDER uses."""
 
     def run(self) -> int:
         from raytac.optics.taxim.bake.settings import BakeSettings

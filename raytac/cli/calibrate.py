@@ -22,7 +22,7 @@ _OF_MARKERS = ("level", "quick", "verbose")
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateArgs(FitOptions, SolverOptions):
-    """Fit a sensor's optics to photographs of ball presses, or the marker motion of its pad to the soft pad.
+    """Fit a sensor's optics to photographs of presses, or its marker motion to the soft pad.
 
     With a data set (docs/real-images.md), --model raytrace writes lights.toml and sensor.toml, --model taxim a calibration folder and
     --model mlp mlp.npz, each beside circles.csv and metrics.json, which says data, split, errors and date. Every fifth press is held
@@ -37,13 +37,13 @@ class CalibrateArgs(FitOptions, SolverOptions):
     what: Annotated[str, tyro.conf.Positional]
     """`markers`, or a folder of photographs or a dataPack.npz."""
     model: Literal["raytrace", "taxim", "mlp"] = "raytrace"
-    """Model that is fitted to a data set; table and network take imprint and circles from a fit of the lights too."""
+    """Model to fit to a data set; table and network start with a fit of the lights, too."""
     holdout: int = 5
     """Interval of the presses that are held out and scored: 5 is every fifth; 0 holds out none."""
     shadows: bool = False
-    """Let the ray tracer cast shadows on the coat while it is fitted; sensor.toml then asks for the same."""
+    """Let the ray tracer cast shadows on the coat in the fit, and in sensor.toml."""
     shadow_table: Literal["none", "raytrace"] = "none"
-    """Shadows of --model taxim: none, or those of pins that the fitted ray tracer casts (docs/taxim-table.md says what they are worth)."""
+    """Shadows of --model taxim: none, or of pins in the fitted ray tracer (docs/taxim-table.md)."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file; it needs no markers of its own."""
     level: Annotated[str, named(PADS)] = "medium"

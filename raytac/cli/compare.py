@@ -36,10 +36,11 @@ class CompareArgs(SolverOptions):
     batch: int | None = None
     """Environments of the batched timing; 8 on the CPU and 64 on CUDA if not given."""
     level: Annotated[str | None, named(PADS)] = None
-    """Also press into the soft pad of this level, and report what the rigid pad misses. Left out if not given."""
+    """Also press into the soft pad of this level, and report what the rigid pad misses."""
     markers: bool = False
-    """Also report how far the marker models are from surface tracking under normal load, shear and twist, on the soft pad of the level
-    that --level names, else medium; needs a sensor with marker motion."""
+    """Also compare marker models with surface tracking on the soft pad (--level, else medium).
+
+    Under normal load, shear and twist; needs a sensor with marker motion."""
     quick: bool = False
     """80x60, one scene, few samples and modes: shows that all runs; its figures mean nothing."""
 

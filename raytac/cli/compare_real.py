@@ -14,10 +14,10 @@ from raytac.cli.shared import FitOptions, print_paths
 
 @dataclass(frozen=True, kw_only=True)
 class CompareRealArgs(FitOptions):
-    """Fit ray tracer, table and network to the same real presses of balls and test them, and Phong's model, on the others.
+    """Fit ray tracer, table and network to real presses of balls, and test them on the others.
 
-    Writes real.md (tables), real.png (photographs, every mode, signed errors) and metrics.json. Without --out the folder is
-    runs/compare-real/SENSOR. An error or Ctrl-C leaves the folder as it was.
+    Phong's model is tested too. Writes real.md (tables), real.png (photographs, every mode, signed errors) and metrics.json. Without
+    --out the folder is runs/compare-real/SENSOR. An error or Ctrl-C leaves the folder as it was.
     """
 
     data: Annotated[Path, tyro.conf.Positional]
@@ -27,13 +27,13 @@ class CompareRealArgs(FitOptions):
     folds: int = 5
     """Number of folds: each is held out in turn, every fifth press with 5."""
     tested: int | None = None
-    """Number of folds that are fitted and tested, for a run that is about regions or ablations; all if not given."""
+    """Number of folds to fit and test, for a run about regions or ablations; all if not given."""
     regions: bool = True
     """Also fit to one half of the pad and to shallow presses, and test on the others."""
     ablations: bool = True
     """Also fit the ray tracer with one thing after another left out."""
     shadows: bool = False
-    """Let the ray tracer cast shadows on the coat: photographs of a GelSight Mini show next to none (docs/accuracy.md)."""
+    """Let the ray tracer cast shadows on the coat; a real Mini shows next to none."""
 
     def run(self) -> int:
         began = time.perf_counter()

@@ -30,7 +30,7 @@ class PressArgs(ShadowOptions, SolverOptions):
     """
 
     scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """Name of a shipped press scene, such as coin; path of a scene file; or an STL, OBJ or PLY file, with --depth."""
+    """Name of a shipped press, path of a scene file, or an STL, OBJ or PLY file with --depth."""
     depth: float | None = None
     """Depth that a mesh file is pressed in to [mm]; scenes have their own."""
     scale: float | None = None
@@ -38,29 +38,31 @@ class PressArgs(ShadowOptions, SolverOptions):
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
     physics: Annotated[str | None, named(PHYSICS.names)] = None
-    """Model of the gel: rigid (geometry and Gaussians) or ipc (finite elements with contact and friction; soft objects need
-    raytac[ipc]). If not given, as the scene says, else rigid."""
+    """Model of the gel: rigid (geometry and Gaussians) or ipc (finite elements with contact).
+
+    If not given, as the scene says, else rigid. Soft objects need raytac[ipc]."""
     level: Annotated[str | None, named(PADS)] = None
-    """Resolution of a soft pad's mesh, so that physics is ipc if not given; as the scene says if not given, else coarse."""
+    """Resolution of a soft pad's mesh, makes physics ipc; as the scene says, else coarse."""
     optics: Annotated[str, named(OPTICS.names)] = "raytrace"
-    """Optical mode: raytrace, taxim (a table, baked from the ray tracer at first use unless a calibration is given), phong, or mlp (a
-    network, which weights must give). The options below that a mode has are fields of its configuration."""
+    """Optical mode: raytrace, taxim (a table, baked at first use), phong or mlp (a network).
+
+    A --calibration replaces the baked table; mlp needs weights. The options below that a mode has are fields of its configuration."""
     calibration: Path | None = None
-    """taxim: calibration folder, such as those that raytac bake writes; the sensor's own baked table if not given."""
+    """taxim: calibration folder, as raytac bake writes; the sensor's baked table if not given."""
     weights: Path | None = None
     """mlp: folder of raytac calibrate DATASET --model mlp."""
     markers: Annotated[str | None, named(MARKERS.names)] = None
-    """Model that moves the sensor's markers; surface needs physics ipc. The sensor must have markers, as gelsight_mini_7x9 has. Writes
-    markers.npz, and images show the dots. None if not given."""
+    """Model that moves the sensor's markers; surface needs physics ipc. None if not given.
+
+    The sensor must have markers, as gelsight_mini_7x9 has. Writes markers.npz, and images show the dots."""
     integrator: Annotated[str | None, named(INTEGRATORS)] = None
-    """raytrace: fast (quadrature over the LEDs, no noise), reference (path tracing of raytac's own) or path (Mitsuba's, to compare);
-    fast if not given."""
+    """raytrace: fast (no noise, the default), reference (our path tracer) or path (Mitsuba's)."""
     spp: int | None = None
-    """raytrace. fast: rays a pixel, a square number, 1 if not given; reference and path: samples a pixel, 256 if not given."""
+    """raytrace: rays a pixel (fast: a square number) or samples; 1 and 256 if not given."""
     resolution: str | None = None
-    """WIDTHxHEIGHT of the images in pixels, as in 320x240, at most 8192 a side; the sensor's own if not given."""
+    """WIDTHxHEIGHT of the images [px], as in 320x240, up to 8192; the sensor's if not given."""
     outputs: Annotated[str | None, named(OUTPUTS)] = None
-    """Outputs to compute, joined by commas: rgb, layers (raytrace only), normals, depth, height, wrench, traction. All if not given."""
+    """Outputs to compute, joined by commas; all if not given. Only raytrace has layers."""
 
     def run(self) -> int:
         start = time.perf_counter()

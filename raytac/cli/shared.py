@@ -23,8 +23,10 @@ from raytac.specs import PressScene, SensorSpec, TaskScene, load_sensor, with_li
 from raytac.specs.sensor import AUTO
 
 FROM_SCRATCH = "12,8,9"
-"""Numbers of LEDs that the Mini's main figures of docs/accuracy.md are of. Priors hold a fit to its start, and the shipped sensors' own
-lights were fitted to photographs: begun from these, presses that are held out would not be new to it."""
+"""Numbers of LEDs of the Mini's main figures in docs/accuracy.md.
+
+Priors hold a fit to its start, and the shipped sensors' own lights were fitted to photographs: begun from these, presses that are
+held out would not be new to it."""
 OWN_LEDS = "own"
 
 
@@ -45,10 +47,9 @@ def read_data(
 ) -> tuple[SensorSpec, RealPresses, Photographs, list[str]]:
     """The sensor, its fully visible presses as read and as floats, and names of doubtful ones.
 
-    A press is doubtful if its circle was found in the image without a clear step of colour.
-
-    ``sides`` as of ``leds_at_walls``, or ``OWN_LEDS``, each of which then is ``split`` into so many. ``device``: where an exposure of
-    ``AUTO`` is found, under the sensor's own lights.
+    A press is doubtful if its circle was found in the image without a clear step of colour. ``sides`` as of ``leds_at_walls``, or
+    ``OWN_LEDS``, each of which then is ``split`` into so many. ``device``: where an exposure of ``AUTO`` is found, under the
+    sensor's own lights.
 
     Raises:
         SpecError, InputError, CalibrationError: as the readers say.
@@ -77,18 +78,21 @@ class FitOptions(CommonOptions):
     ball_diameter_mm: float | None = None
     """Needed by a dataPack.npz, which does not say it."""
     sides: str = FROM_SCRATCH
-    """Numbers of red, green and blue LEDs joined by commas, which begin at their walls; `own` begins at the sensor's own lights. Where
-    these were fitted to photographs that are tested on, errors are not of held-out presses."""
+    """Numbers of red, green, blue LEDs at their walls, joined by commas; or `own`, the sensor's.
+
+    Where those were fitted to photographs that are tested on, errors are not of held-out presses."""
     split: int = 1
-    """With `--sides own`: LEDs that each of the sensor's own is split into, side by side over 1.5 times its width, as LEDs behind
-    a diffuser light like a row."""
+    """With `--sides own`: LEDs that each is split into, side by side over 1.5 times its width.
+
+    LEDs behind a diffuser light like a row."""
     starts: int = 3
     """Starts of a fit of direct light; the best goes on."""
     rounds: int = 3
     """Rounds with the ray tracer after direct light."""
     prior: str = INNER
-    """Strength of the LEDs' priors: free, tied, tied-dark, tied-darkest (docs/real-images.md), or `inner`, which chooses by
-    cross-validation between halves of the pad within the presses that are fitted to."""
+    """Strength of the LEDs' priors: free, tied, tied-dark, tied-darkest (docs/real-images.md).
+
+    Or `inner`, which chooses by cross-validation between halves of the pad within the presses that are fitted to."""
 
     @property
     def chosen_prior(self) -> str | None:
@@ -123,7 +127,7 @@ class SolverOptions(CommonOptions):
     """Options of a command that may use the contact solver."""
 
     verbose: bool = False
-    """Let Warp, on which the contact solver runs, list devices and the kernels that it loads; warnings and errors only if not given."""
+    """Let Warp, on which the contact solver runs, list devices and the kernels that it loads."""
 
     def prepare_solver(self) -> None:
         """Call before the solver is first used."""

@@ -32,36 +32,36 @@ _LONGEST = 320
 
 @dataclass(frozen=True, kw_only=True)
 class ViewArgs(ShadowOptions):
-    """Show a scene in the browser: 3-D view, tactile images, play, pause and step, and sliders that press or steer; needs raytac[view].
+    """Show a scene in the browser: 3-D view, tactile images, and sliders that press or steer.
 
-    Prints the address to open and serves until Ctrl-C. On another machine: ssh -L 8080:127.0.0.1:8080 HOST, then open
-    http://127.0.0.1:8080 here.
+    Needs raytac[view]. Prints the address to open and serves until Ctrl-C. On another machine: ssh -L 8080:127.0.0.1:8080 HOST, then
+    open http://127.0.0.1:8080 here.
     """
 
     scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Name of a shipped press or task, such as sphere or lift_cube, or path of a scene file."""
     sensor: str | None = None
-    """Name of a shipped sensor, or path of a sensor file; a task names its own, a press takes gelsight_mini if not given."""
+    """Name of a shipped sensor, or path of a file; the task's, or gelsight_mini, if not given."""
     physics: Annotated[str | None, named(PHYSICS.names)] = None
-    """Model of the gel: rigid (geometry and Gaussians) or ipc (finite elements). If not given, as the scene says,
-    else rigid."""
+    """Model of the gel: rigid or ipc (finite elements); as the scene says, else rigid."""
     level: Annotated[str | None, named(PADS)] = None
-    """Resolution of a soft pad's mesh, so that physics is ipc if not given; as the scene says if not given, else coarse."""
+    """Resolution of a soft pad's mesh, makes physics ipc; as the scene says, else coarse."""
     optics: Annotated[str, named(OPTICS.names)] = "raytrace"
     """Optical mode: raytrace, taxim (a table, baked at first use: minutes) or phong."""
     markers: Annotated[str | None, named(MARKERS.names)] = None
-    """Model that moves the sensor's markers; the sensor must have markers, as gelsight_mini_7x9 has. None if not given."""
+    """Model that moves markers, of a sensor that has some, as gelsight_mini_7x9."""
     coupling: Annotated[str | None, named(COUPLINGS)] = None
-    """Coupling of soft pads to a task's robot: two_way if their forces act back on it. As the task says if not given."""
+    """Coupling of soft pads to the robot, two_way if forces act back; else as the task says."""
     steps: int | None = None
-    """Control steps of a task from one shown state to the next; 1 if not given, 4 with rigid pads without markers."""
+    """Control steps from one shown state to the next; 1, or 4 with rigid pads without markers."""
     resolution: str | None = None
-    """WIDTHxHEIGHT of the tactile image in pixels; the sensor's own if not given, a larger one scaled down to 320 pixels a side."""
+    """WIDTHxHEIGHT of the tactile image [px]; the sensor's, scaled to at most 320, if not given."""
     host: str = "127.0.0.1"
-    """Address to serve at. Whoever can reach it can move the sliders: 127.0.0.1 is this machine only, 0.0.0.0 everyone."""
+    """Address to serve at: 127.0.0.1 is this machine, 0.0.0.0 lets everyone move the sliders."""
     allow_host: str | None = None
-    """Names beside this machine's addresses that browsers may open the page by, joined by commas: gpu3.example.org, or NAME:PORT where
-    something forwards another port. All other names are refused."""
+    """Names that browsers may open the page by beside the addresses, joined by commas.
+
+    As gpu3.example.org, or NAME:PORT where something forwards another port. All other names are refused."""
     port: int = 8080
     """Port to serve at; 0 takes any that is free."""
     device: DeviceName = "auto"

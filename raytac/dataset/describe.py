@@ -88,11 +88,7 @@ def write_description(folder: Path, description: dict[str, Any]) -> None:
 
 
 def read_description(folder: Path) -> dict[str, Any]:
-    """``dataset.json`` of a data set.
-
-    Raises:
-        InputError: there is none, it cannot be read, it lacks a key or has one of another kind, or it is of a later format.
-    """
+    """``dataset.json`` of a data set; ``InputError`` for none, or for a damaged or later one."""
     path = Path(folder) / FILE
     try:
         description = json.loads(read_regular(path))

@@ -1,7 +1,4 @@
-"""``PressDataset``: presses of a data set by number, as dictionaries of arrays.
-
-It needs NumPy and pyarrow alone.
-"""
+"""``PressDataset``: presses of a data set by number; needs NumPy and pyarrow alone."""
 
 from __future__ import annotations
 
@@ -98,10 +95,7 @@ class PressDataset:
         return arrays | {name: np.asarray(values[i]) for name, values in self._columns.items()}
 
     def shared(self, i: SupportsIndex) -> dict[str, np.ndarray]:
-        """Arrays that all presses of press ``i``'s shard share: grid, height and image at rest.
-
-        Errors as for ``data[i]``.
-        """
+        """Arrays of press ``i``'s shard: grid, height and image at rest. Errors as for ``data[i]``."""
         shard = self._shard(self._shards[self._place(i)])
         return {name: np.array(shard[name]) for name in self.description["arrays_of_a_shard"]}
 
@@ -163,10 +157,7 @@ def _shard_files(folder: Path, table: Any, sensors: Mapping[str, Any]) -> dict[s
 
 
 def _declared(description: dict[str, Any], file: _ShardFile) -> tuple[dict[str, ArrayKind], dict[str, int]]:
-    """Kinds of a shard's arrays as in ``dataset.json``, and the sizes that are known.
-
-    Shapes are those of its sensor.
-    """
+    """Kinds of a shard's arrays as in ``dataset.json``, with its sensor's shapes; known sizes."""
     own: dict[str, Any] = description["sensors"][file.sensor]["arrays"]
     declared = {**description["arrays"], **description["arrays_of_a_shard"]}
     kinds = {name: ArrayKind(item["dtype"], tuple(own.get(name, item["shape"])), "", "") for name, item in declared.items()}

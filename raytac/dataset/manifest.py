@@ -1,7 +1,4 @@
-"""``manifest.parquet``: one row a press, with parameters, forces and place of its arrays.
-
-Failed presses have rows too.
-"""
+"""``manifest.parquet``: a row a press, failed or not: parameters, forces, place of arrays."""
 
 from __future__ import annotations
 

@@ -205,10 +205,7 @@ class DatasetPlan:
         return count * self.press_bytes(sensor) + _bytes(self.array_shapes(sensor, SHARED), SHARED)
 
     def total_bytes(self, without: Collection[int] = ()) -> int:
-        """Bytes on disk of all shards but those ``without``, as ``shard_bytes``.
-
-        The time does not grow with their number.
-        """
+        """Bytes on disk of all shards but those ``without``, in a time that does not grow."""
         kinds, last = len(self.sweep.sensors), self.shards - 1
         done = Counter(shard % kinds for shard in without)  # shards take turns over the sensors
         total = 0

@@ -39,10 +39,7 @@ class _Worker:
         return ""
 
     def render(self, shard: int) -> ShardResult | str:
-        """The shard, or an error's text.
-
-        Errors whose constructors take keywords do not travel between processes.
-        """
+        """The shard, or an error's text: errors with keywords do not travel between processes."""
         try:
             return replace(self._renderer.render(shard), worker=f"{os.uname().nodename}:{os.getpid()}")
         except RaytacError as error:

@@ -79,11 +79,7 @@ class ShardRenderer:
         self._for(shard)
 
     def render(self, shard: int) -> ShardResult:
-        """Press and image all presses of a shard; those that fail are in ``rows`` with their reason.
-
-        Raises:
-            BackendError: a renderer, solver or device does not work here.
-        """
+        """Press and image all presses of a shard; failed ones are in ``rows``. Raises BackendError."""
         presses, built = self.plan.presses(shard), self._for(shard)
         arrays: dict[int, dict[str, np.ndarray]] = {}
         notes: dict[int, Row] = {}

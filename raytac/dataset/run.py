@@ -162,10 +162,7 @@ def _ordered(records: dict[int, ShardRecord]) -> list[ShardRecord]:
 
 
 def _check_same(folder: Path, plan: DatasetPlan, store: ShardStore) -> None:
-    """Refuse a folder with shards of another plan.
-
-    A description without any shard is of a run that rendered nothing.
-    """
+    """Refuse a folder with shards of another plan; a description alone is of an empty run."""
     shards = folder / FOLDER
     if os.path.lexists(shards) and not shards.is_dir():
         raise InputError("out", value=shards, rule="must be a folder, or not exist")

@@ -1,7 +1,4 @@
-"""NumPy arrays as the contents of ``.npy`` and ``.npz`` files.
-
-They hold no objects, and equal arrays give equal bytes.
-"""
+"""Arrays as bytes of ``.npy`` and ``.npz`` files: no objects, equal bytes for equal arrays."""
 
 from __future__ import annotations
 

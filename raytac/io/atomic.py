@@ -48,11 +48,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def open_regular(path: Path) -> io.BufferedReader:
-    """Open a regular file for reading; a pipe or a device of that name is an error.
-
-    Raises:
-        OSError: it does not exist, cannot be read, or is something else.
-    """
+    """Open a regular file for reading; ``OSError`` for a pipe, a device, or nothing."""
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     if not stat.S_ISREG(os.fstat(handle).st_mode):
         os.close(handle)

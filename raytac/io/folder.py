@@ -123,8 +123,7 @@ class FolderLock:
         except OSError as error:
             if os.path.lexists(folder / LOCK):
                 raise InputError("out", value=folder / LOCK, rule=f"{_KIND} ({error.strerror})") from error
-            rule = f"must be a folder that can be written ({error.strerror})"
-            raise InputError("out", value=folder, rule=rule) from error
+            raise InputError("out", value=folder, rule=f"must be a folder that can be written ({error.strerror})") from error
         try:
             if not stat.S_ISREG(os.fstat(handle).st_mode):
                 raise InputError("out", value=folder / LOCK, rule=_KIND)

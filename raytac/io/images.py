@@ -91,11 +91,7 @@ def write_exr(path: Path, channels: Mapping[str, np.ndarray], header: Mapping[st
 
 
 def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Channels by name, each (H, W), and ``raytac:`` header attributes without that prefix.
-
-    Raises:
-        InputError: the file is missing or is not an EXR file.
-    """
+    """Channels by name, (H, W), and ``raytac:`` attributes; ``InputError`` if it is no EXR."""
     import OpenEXR
 
     if not path.is_file():
@@ -110,11 +106,7 @@ def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
 
 
 def write_sheet(pictures: list[Path], out: Path, *, gap: int = 24) -> None:
-    """Stack PNG files under each other, ``gap`` white pixels apart, white on the right.
-
-    Raises:
-        InputError: no pictures.
-    """
+    """Stack PNG files, ``gap`` white pixels apart, white on the right; ``InputError`` for none."""
     if not pictures:
         raise InputError("pictures", value=[], rule="must name at least one picture")
     images = [read_png(path) for path in pictures]

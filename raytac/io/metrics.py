@@ -77,11 +77,7 @@ def write_metrics(path: Path, values: Mapping[str, object]) -> dict[str, Metric]
 
 
 def read_metrics(path: Path) -> dict[str, Metric]:
-    """Read and check a ``metrics.json``.
-
-    Raises:
-        InputError: the file is not one flat object of dotted keys to numbers or strings.
-    """
+    """Read and check a ``metrics.json``; ``InputError`` if it is not one flat object."""
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

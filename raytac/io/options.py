@@ -14,13 +14,10 @@ DeviceName = Literal["auto", "cpu", "cuda"]
 
 @dataclass(frozen=True, kw_only=True)
 class CommonOptions:
-    """Base of an ``Args`` dataclass.
-
-    Write ``@dataclass(frozen=True, kw_only=True) class Args(CommonOptions)``.
-    """
+    """Base of ``@dataclass(frozen=True, kw_only=True) class Args(CommonOptions)``."""
 
     out: Path | None = None
-    """Folder to write to, created if need be; a folder under runs/ named after the job if not given."""
+    """Folder to write to, created if need be; one under runs/ for the job if not given."""
     device: DeviceName = "auto"
     """Device to compute on; auto is CUDA if it works, else the CPU."""
     seed: int = 0
@@ -40,11 +37,7 @@ def parse_resolution(text: str) -> tuple[int, int]:
 
 
 def parse_names(text: str, option: str, choices: tuple[str, ...] | None = None) -> tuple[str, ...]:
-    """``"sphere, coin"`` to ``("sphere", "coin")``: names joined by commas, each once.
-
-    Raises:
-        InputError: none, or one that is not in ``choices`` (None is any).
-    """
+    """Names joined by commas, each once; ``InputError`` for none, or if not in ``choices``."""
     names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
     for name in names:
         if choices is not None and name not in choices:

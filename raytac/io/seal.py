@@ -15,10 +15,7 @@ _SIZE = hashlib.sha256().digest_size
 
 
 class SealError(ValueError):
-    """A sealed file differs from its digest.
-
-    It is empty, cut short, changed, or was written under another name.
-    """
+    """A sealed file differs from its digest: empty, cut short, changed, or of another name."""
 
 
 def write_sealed(path: Path, data: bytes) -> None:

@@ -1,7 +1,4 @@
-"""Interface of every optical mode.
-
-A configuration builds the mode, which takes a GelSurface and returns images.
-"""
+"""Interface of every optical mode: a configuration builds what turns surfaces into images."""
 
 from __future__ import annotations
 
@@ -84,10 +81,7 @@ class OpticsConfig(Generic[Mode]):
 
     @property
     def sampled(self) -> bool:
-        """True if images have noise, so that ``render`` takes ``spp`` and ``seed``.
-
-        A comparison then measures several numbers of samples.
-        """
+        """True if images have noise, so that ``render`` takes ``spp`` and ``seed``."""
         return False
 
     @property

@@ -40,7 +40,7 @@ class PadReading:
     """
 
     stage: int = -1
-    """Index in the press scene's trajectory; −1 before the first stage, of a stage that is not the scene's, and in a world."""
+    """Index in the scene's trajectory; −1 before the first stage, of other stages, in a world."""
     kind: str = ""
     """Kind of that stage, or ``start``; empty in a world."""
     fraction: float = 1.0
@@ -63,7 +63,7 @@ class PadReading:
         solved: Any = None,
         shear: ContactShear | None = None,
     ) -> None:
-        """Keep what is given (see the class), and call a function when its result is first asked for; None is not known."""
+        """Keep what is given (see the class); a function is called on demand, None is not known."""
         self._surface, self._wrench, self._traction, self.has_forces = surface, wrench, traction, wrench is not None
         self.failed = np.zeros(self.surface.batch, bool) if failed is None else failed
         self.unconverged, self.force_law_area = unconverged, force_law_area
@@ -79,10 +79,7 @@ class PadReading:
 
     @cached_property
     def wrench(self) -> np.ndarray:
-        """Force on the pad [N] and torque about the frame's origin [N m], (B, 6).
-
-        NaN of a bare surface.
-        """
+        """Force on the pad [N], torque about the frame's origin [N m], (B, 6); NaN if not known."""
         if self._wrench is None:
             return np.full((len(self.failed), 6), np.nan)
         return self._wrench(self.surface) if callable(self._wrench) else self._wrench
@@ -150,19 +147,15 @@ class Pad(Protocol):
         ...
 
     def object_height(self, surface: GelSurface) -> np.ndarray | None:
-        """Underside of the object at the surface's poses [m], (B, Ny, Nx).
-
-        inf where it is not; None without an object.
-        """
+        """Underside of the object [m], (B, Ny, Nx), inf where it is not; None without an object."""
         ...
 
 
 class PhysicsConfig(Protocol):
     """Configuration of one physics: a frozen dataclass that checks itself.
 
-    ``raytac.physics.register`` makes it known by a name.
-
-    A field ``level`` that is None is filled with the scene's, else ``coarse``.
+    ``raytac.physics.register`` makes it known by a name. A field ``level`` that is None is filled with the scene's, else
+    ``coarse``.
     """
 
     is_simulated: ClassVar[bool]

@@ -25,7 +25,7 @@ def layer_compliance(wave_number: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
 
 
 def relative_compliance(ratio: np.ndarray, nu: float) -> np.ndarray:
-    """``layer_compliance`` over that of a half-space, at each wave number times thickness, of at most 20."""
+    """``layer_compliance`` over a half-space's, at each wave number times thickness up to 20."""
     κ = 3.0 - 4.0 * nu
     return (κ * np.sinh(2.0 * ratio) - 2.0 * ratio) / _determinant(ratio, nu)
 

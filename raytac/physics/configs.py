@@ -43,9 +43,9 @@ class Ipc:
     """
 
     level: str | PadMesh | None = None
-    """Resolution of the mesh, one of ``PADS``, or a mesh of one's own; None is the scene's, else ``coarse``."""
+    """Resolution of the mesh, one of ``PADS``, or a mesh; None: the scene's, else ``coarse``."""
     correction: Correction | None = DEFAULT_CORRECTION
-    """Correction of the surface below the size of the mesh's cells; None is the plain finite-element surface."""
+    """Correction of the surface below the cells' size; None: the plain finite-element surface."""
     control: PressControl = DEFAULT_CONTROL
     """Tolerances and search of a press; worlds have their own."""
     is_simulated: ClassVar[bool] = True
@@ -65,10 +65,7 @@ class Ipc:
         return f"ipc-{level if isinstance(level, str) else 'own'}"
 
     def build(self, spec: SensorSpec, press: PressScene, *, device: str = "auto", **settings: Any) -> SoftPad:
-        """The pad of a press, as ``PhysicsConfig.build``.
-
-        The solver traces no rays, so that CUDA needs no OptiX.
-        """
+        """The pad of a press, as ``PhysicsConfig.build``; no ray is traced: CUDA needs no OptiX."""
         from raytac.physics.soft.pad import SoftPad
 
         device = resolve_device(device, ray_tracing=False)

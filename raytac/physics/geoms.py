@@ -1,7 +1,4 @@
-"""From the geoms of a MuJoCo model to parts of the height-field code.
-
-So any MuJoCo object can be pressed in.
-"""
+"""Parts of the height-field code from geoms of MuJoCo, so that any object can be pressed in."""
 
 from __future__ import annotations
 
@@ -97,10 +94,7 @@ def _index(model: mujoco.MjModel, kind: mujoco.mjtObj, count: int, what: str, gi
 
 
 def _mesh(model: mujoco.MjModel, data: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) [m] and faces (F, 3) of a mesh, in the frame of the geom that shows it.
-
-    MuJoCo has centred them.
-    """
+    """Vertices (V, 3) [m], which MuJoCo has centred, and faces (F, 3) of a mesh, geom's frame."""
     vertex, face = int(model.mesh_vertadr[data]), int(model.mesh_faceadr[data])
     vertices = model.mesh_vert[vertex : vertex + int(model.mesh_vertnum[data])]
     return vertices, model.mesh_face[face : face + int(model.mesh_facenum[data])]

@@ -1,7 +1,4 @@
-"""Size of a MuJoCo model, read from its XML before it is compiled.
-
-Compiling takes as much time and memory as the XML asks for.
-"""
+"""Size of a MuJoCo model, read from its XML before compiling, which takes what that asks."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from pathlib import Path
 from raytac.errors import InputError
 
 MOST_COPIES = 100_000
-"""Copies that ``replicate``, ``composite`` and ``flexcomp`` elements within each other may make of what is in them."""
+"""Copies that nested ``replicate``, ``composite`` and ``flexcomp`` elements may make."""
 MOST_NODES = 2**22
 """Nodes of a height field."""
 _LARGEST = 2**26
@@ -91,11 +88,7 @@ def _unescaped(text: str) -> str:
 
 
 def _is_file(path: Path) -> bool:
-    """True if ``path`` is a file, False if nothing is there.
-
-    Raises:
-        InputError: something else is there; opening it may wait for ever.
-    """
+    """True for a file, False for nothing; ``InputError`` for what may wait for ever."""
     try:
         if path.is_file() or not path.exists():
             return path.is_file()

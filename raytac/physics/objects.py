@@ -9,9 +9,8 @@ from typing import Protocol
 import numpy as np
 
 from raytac.errors import InputError, SpecError
-from raytac.shapes.coin import coin_elevation
 from raytac.shapes.part import Part, mesh_part, primitive
-from raytac.shapes.relief import relief_part
+from raytac.shapes.relief import coin_elevation, relief_part
 from raytac.specs.press import ObjectSpec
 from raytac.specs.shape_file import OBJECT_SCHEMA
 
@@ -30,14 +29,13 @@ def object_parts(spec: Shape) -> tuple[Part, ...]:
     """Parts of the object, object frame [m]; empty for ``none``.
 
     The −z side looks at the pad when the quaternion is the identity. ``sphere``: centre at the origin. ``cylinder``: axis z,
-    centre at the origin (standing; turn it by 90° about y to lie along x). ``box``: length along x, width along y, height along z,
-    centre at the origin. ``edge``: a cube about the origin with one edge down, along x. ``cone``: rounded tip down at the origin,
-    base of the given radius at ``height`` above it. ``torus``: axis z, lying flat. ``pins``: a plate with rows × columns (y × x)
-    of flat-ended pins, ``pin_height`` long, under its face z = 0. ``plane``: the half-space under z = 0 (task scenes only).
-    ``coin``: face down, field at z = 0. ``mesh``: as its file has it. ``mjcf``: every geom of one body, body frame.
-    ``heights``: a relief under z = 0, centred.
-    Curved parts are exact shapes, not facets. Raises ``SpecError`` for an unknown kind, a missing or impossible length, or a model
-    that MuJoCo refuses or that has no such body.
+    centre at the origin (standing; turn it by 90° about y to lie along x). ``box``: length along x, width along y, height along
+    z, centre at the origin. ``edge``: a cube about the origin with one edge down, along x. ``cone``: rounded tip down at the
+    origin, base of the given radius at ``height`` above it. ``torus``: axis z, lying flat. ``pins``: a plate with rows × columns
+    (y × x) of flat-ended pins, ``pin_height`` long, under its face z = 0. ``plane``: the half-space under z = 0 (task scenes
+    only). ``coin``: face down, field at z = 0. ``mesh``: as its file has it. ``mjcf``: every geom of one body, body frame.
+    ``heights``: a relief under z = 0, centred. Curved parts are exact shapes, not facets. Raises ``SpecError`` for an unknown
+    kind, a missing or impossible length, or a model that MuJoCo refuses or that has no such body.
     """
     if spec.kind == "plane":
         return (primitive("plane"),)
@@ -95,10 +93,7 @@ def _coin(spec: Shape) -> tuple[Part, ...]:
 
 
 def _heights(spec: ObjectSpec) -> Part:
-    """The map in a square of zeros, which are no object.
-
-    Beyond its last rows and columns the height falls to 0 over one pitch.
-    """
+    """The map in a square of zeros, no object; at its ends it falls to 0 over one pitch."""
     data, pitch = np.array(spec.heights), _length(spec, "pitch")
     rows, columns = data.shape
     n = max(rows, columns)

@@ -162,7 +162,7 @@ class PressTargets:
 
 
 CLEARANCE = 1e-3
-"""Height above first touch [m] at which an object waits before the press and after a release."""
+"""Height above first touch [m] at which an object waits before a press, after a release."""
 MOST_STEPS = 1_000_000
 """States that a stage can be asked for."""
 
@@ -276,20 +276,14 @@ class PressPad(ABC):
         yield from self._through(-1, stage, steps)
 
     def peak(self, readings: Iterable[PadReading]) -> PadReading:
-        """First of ``readings`` at the end of the scene's peak stage (the start, if it has none).
-
-        Later ones are not computed.
-        """
+        """First of ``readings`` at the end of the scene's peak stage, else the start; none after it."""
         for reading in readings:
             if reading.stage == self.scene.peak_stage and reading.fraction == 1.0:
                 return reading
         raise InputError("readings", value=self.scene.peak_stage, rule="hold none at the end of the scene's peak stage")
 
     def object_height(self, surface: GelSurface) -> np.ndarray | None:
-        """Underside of the object at the surface's poses [m], (B, Ny, Nx).
-
-        inf where it is not; None without an object.
-        """
+        """Underside of the object [m], (B, Ny, Nx), inf where it is not; None without an object."""
         if surface.pad_from_object is None:
             return None
         return object_height(self.parts, surface.pad_from_object, self.grid.x, self.grid.y)

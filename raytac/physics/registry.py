@@ -19,11 +19,7 @@ register = PHYSICS.register
 
 
 def checked_physics(physics: str | PhysicsConfig | None) -> PhysicsConfig | None:
-    """The configuration of a name, or the configuration itself; None stays None.
-
-    Raises:
-        InputError: an unknown name, or what is no configuration.
-    """
+    """Configuration of a name, or itself; None stays None. ``InputError`` for all else."""
     if physics is None:
         return None
     config = PHYSICS.config(physics)

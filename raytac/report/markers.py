@@ -302,10 +302,7 @@ def _magnification(rest: np.ndarray, displacement: np.ndarray) -> float:
 
 
 def write_arrows(path: Path, sensor: SensorSpec, frames: list[PressFrame], *, device: str = "auto") -> None:
-    """Draw markers at the end of held-out presses, a row a load and a column a model.
-
-    ``sensor`` has the marker motion.
-    """
+    """Draw markers at the end of held-out presses, a row a load and a column a model."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 

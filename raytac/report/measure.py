@@ -49,10 +49,7 @@ def timed(call: Callable[[Any], object], inputs: Sequence[Any], frames: int) -> 
 
 
 def timed_within(call: Callable[[Any], object], inputs: Sequence[Any], frames: int, budget_s: float) -> np.ndarray:
-    """As ``timed``, but of at most ``budget_s`` [s] where at least three calls fit.
-
-    A slow call is warmed up once only, by the first input.
-    """
+    """As ``timed``, in at most ``budget_s`` [s] if three calls fit; a slow call warms up once."""
     call(inputs[0])
     first = once(call, inputs[1 % len(inputs)])
     if frames * first <= 1e3 * budget_s:

@@ -23,10 +23,7 @@ _CODE = ("ipc", "raytac.physics")
 
 
 class PressStore:
-    """One ``.npz`` a press in ``folder``, under a digest of all that shapes it.
-
-    That is gelpad, press, level, device, code and versions.
-    """
+    """One ``.npz`` a press, under a digest of gelpad, press, level, device, code and versions."""
 
     def __init__(
         self, folder: Path, gelpad: GelpadSpec, *, pad: str, device: str, code: str, say: Callable[[str], object] = print

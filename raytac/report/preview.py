@@ -87,10 +87,7 @@ def camera_extent_mm(camera: CameraSpec) -> tuple[float, float, float, float]:
 
 
 def difference_to_rest(rgb: np.ndarray, rest_rgb: np.ndarray, full_scale: float = DIFFERENCE_RANGE) -> np.ndarray:
-    """Signed difference of two 8-bit images with grey for none, in [0, 1].
-
-    0.5 + (rgb − rest) / (2 · full_scale), clipped.
-    """
+    """0.5 + (rgb − rest) / (2 · full_scale) of two 8-bit images, clipped to [0, 1]."""
     return np.clip(0.5 + (rgb.astype(np.float32) - rest_rgb.astype(np.float32)) / (2.0 * full_scale), 0.0, 1.0)
 
 

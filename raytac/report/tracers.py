@@ -1,7 +1,4 @@
-"""Optical modes of one sensor, each built once.
-
-A ray tracer fits the case's light and compiles kernels, which takes seconds.
-"""
+"""Optical modes of one sensor, each built once: light of the case and kernels take seconds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Arms and grippers as MuJoCo models: mounting sensors, inverse kinematics, impedance control."""
+"""Arms and grippers as MuJoCo models: mounts, inverse kinematics, impedance control."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Arm in a compiled MuJoCo model: indices, limits and motors of the joints that move one site."""
+"""Arm in a MuJoCo model: indices, limits and motors of the joints that move one site."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from raytac.robots.states import Numbers, numbers, site_pose
 
 
 class Arm:
-    """``n`` hinge or slide joints and the site that they carry, e.g. a sensor's pad frame. Holds indices only, no state.
+    """``n`` hinge or slide joints and the site that they carry; indices only, no state.
 
     Attributes:
         model: the compiled model.
@@ -63,7 +63,7 @@ class Arm:
         return world_from_site(data, self.site)
 
     def jacobian(self, data: mujoco.MjData) -> np.ndarray:
-        """J (6, n), world axes: velocity of the site's origin [m/s] above its angular velocity [rad/s], per joint velocity."""
+        """J (6, n), world axes: the site's velocity [m/s] above its angular velocity [rad/s]."""
         full = np.zeros((6, self.model.nv))
         mujoco.mj_jacSite(self.model, data, full[:3], full[3:], self.site)
         return full[:, self.dof]
@@ -93,7 +93,7 @@ class Arm:
         }
 
     def _mass_index(self) -> np.ndarray:
-        """Index (n, n) into ``data.M``, MuJoCo's lower triangle of the inertia by rows; −1 for joints on different branches."""
+        """Index (n, n) into ``data.M``, the inertia's lower triangle by rows; −1 across branches."""
         model, index = self.model, np.full((len(self), len(self)), -1)
         for i, row in enumerate(self.dof):
             start = int(model.M_rowadr[row])
@@ -108,7 +108,7 @@ class Arm:
         return data.qfrc_bias[self.dof]
 
     def drive(self, data: mujoco.MjData, torque: np.ndarray) -> None:
-        """Command the joints' motors to give ``torque`` (n,) [N·m]; they saturate at ``torque_limit``.
+        """Command the motors to give ``torque`` (n,) [N·m]; they saturate at ``torque_limit``.
 
         Raises ``InputError`` if a joint has no torque motor or a torque is not finite.
         """
@@ -142,7 +142,7 @@ def _ancestors(model: mujoco.MjModel, body: int) -> set[int]:
 
 
 def _motors(model: mujoco.MjModel, joints: Iterable[int]) -> np.ndarray | None:
-    """Torque motor of each joint (unit gain and gear, no bias, no activation), or None if one has none."""
+    """Torque motor of each joint (unit gain and gear, no bias or activation), or None."""
     motors = []
     for joint in joints:
         plain = (

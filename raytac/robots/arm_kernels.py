@@ -1,4 +1,4 @@
-"""Kernels of an arm's control over B environments: springs in the joints, inverse kinematics, differences of poses."""
+"""Kernels of an arm's control over B environments: joint springs, inverse kinematics, poses."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -77,7 +77,7 @@ def pose_errors(
 
 @wp.struct
 class Springs:
-    """Springs in n joints of B environments. (One structure is handed to a kernel sooner than ten arrays.)"""
+    """Springs in n joints of B environments, as one structure, which launches faster."""
 
     joints: wp.array2d(dtype=wp.float64)
     speed: wp.array2d(dtype=wp.float64)
@@ -148,7 +148,7 @@ def along(servo: Servo, env: wp.int32, i: wp.int32, side: wp.int32) -> wp.float6
 
 @wp.kernel
 def servo_step(servo: Servo):
-    """Joint positions (B, n) that remove the pose's error in ``duration``, and joint velocities (B, n) that give the target's twist."""
+    """Joint positions (B, n) without the pose's error, velocities (B, n) of the target's twist."""
     env = wp.tid()
     n = servo.joints.shape[1]
     place = place_of(servo.site, env)

@@ -1,4 +1,4 @@
-"""Poses of sites and bodies in MuJoCo's states, as the last ``mj_kinematics`` or step left them."""
+"""Poses of sites and bodies in MuJoCo's states, of the last ``mj_kinematics`` or step."""
 
 from __future__ import annotations
 

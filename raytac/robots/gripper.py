@@ -1,4 +1,4 @@
-"""Grippers: the servo that opens two fingers, and a frame without an arm that carries two sensors."""
+"""Grippers: the servo that opens two fingers, and a driven frame that carries two sensors."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from raytac.specs.sensor import SensorSpec
 from raytac.specs.sensor_file import sensor_spec
 
 FRAME_JOINTS: Final = ("x", "y", "z", "yaw", "pitch", "roll")
-"""Joints of the driven frame, in order: slides along the world's axes, then hinges about z, y and x, each in the frame that those before it
-have turned. The position actuators of the same names take the displacement from the start [m, rad]."""
+"""Joints of the driven frame, in order: slides along the world's axes, hinges about z, y, x.
+
+Each hinge is in the frame that those before it have turned. Position actuators of these names take the displacement [m, rad]."""
 FACING: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Rotation of a pad that faces the other finger; columns are the pad's x, y, z in the finger's frame."""
+"""Rotation of a pad that faces the other finger: its x, y, z in the finger's frame."""
 
 
 @dataclass(frozen=True)
@@ -30,13 +31,13 @@ class GripperSettings:
     inertia: float = 1e-3
     """Inertia of the driven frame about each axis [kg m²]: that of a box of 0.5 kg, 15 cm wide."""
     frequency: float = 100.0
-    """Natural frequency of the frame's servos without pads and fingers [rad/s]; critically damped."""
+    """Natural frequency of the servos without pads and fingers [rad/s]; critically damped."""
     opening: float = 0.08
     """Greatest opening [m]."""
     finger_mass: float = 0.02
     """Mass of a finger without its sensor [kg]: a guess, the Panda's weigh 15 g."""
     servo: tuple[float, float, float] = (1e4, 100.0, 70.0)
-    """Servo of the opening: gain [N/m], damping [N s/m], greatest force [N], as in ``scenes/robots/panda_hand.xml``."""
+    """Servo of the opening: gain [N/m], damping [N s/m], greatest force [N]; the Panda's."""
 
 
 def floating_gripper(
@@ -46,10 +47,11 @@ def floating_gripper(
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
     settings: GripperSettings | None = None,
 ) -> RobotModel:
-    """Two sensors, ``left`` and ``right``, on fingers of a frame that six position servos drive, without gravity.
+    """Two sensors, ``left`` and ``right``, on fingers of a frame that six position servos drive.
 
-    The pads face each other as on the Panda's hand (``two_finger_panda``): a pad's z points to the other finger, its y along z of the
-    frame. The site ``tcp`` lies midway between both pads, its z in the direction of the fingers, its y from the right pad to the left one.
+    There is no gravity. The pads face each other as on the Panda's hand (``two_finger_panda``): a pad's z points to the other
+    finger, its y along z of the frame. The site ``tcp`` lies midway between both pads, its z in the direction of the fingers, its
+    y from the right pad to the left one.
 
     Args:
         sensor: the sensor to mount twice, or its name or path.

@@ -1,4 +1,4 @@
-"""Impedance control: torques by which an arm acts as a mass on springs, in Cartesian or in joint space.
+"""Impedance control: torques that make an arm a mass on springs, Cartesian or in joints.
 
 Both add C(q, q̇) q̇ + g(q), which compensates gravity. Read the state after ``mj_forward`` or ``mj_step1``.
 """
@@ -18,7 +18,7 @@ from raytac.robots.joint_springs import JointSprings
 from raytac.se3 import check_pose, pose_error
 
 _SINGULAR = 1e-3
-"""Added to J M⁻¹ Jᵀ [1/kg]: near a singularity the arm then has a finite mass of 1000 kg in the singular direction."""
+"""Added to J M⁻¹ Jᵀ [1/kg]: a finite mass of 1000 kg in a singular direction."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class JointTorque:
     torque: np.ndarray
     """Torques (…, n) [N·m] by the law."""
     saturated: np.ndarray
-    """True (…, n) for torques beyond the motors' limits: MuJoCo then applies the limit, and the law does not hold. False without motors."""
+    """True (…, n) where MuJoCo cuts a torque at the motor's limit; False without motors."""
 
 
 class CartesianImpedance:
@@ -118,14 +118,14 @@ class CartesianImpedance:
 
 
 class JointImpedance:
-    """Springs in the joints, all of one frequency: τ = M (ω² (q_d − q) + 2 ζ ω (q̇_d − q̇)) + C q̇ + g.
+    """Springs in the joints: τ = M (ω² (q_d − q) + 2 ζ ω (q̇_d − q̇)) + C q̇ + g.
 
     The computed torque law (J. J. Craig, "Introduction to Robotics", chapter 10): each joint's error obeys ë + 2 ζ ω ė + ω² e = 0.
     It follows the velocities of differential inverse kinematics.
     """
 
     def __init__(self, arm: Arm, *, frequency: float = 30.0, damping_ratio: float = 1.0) -> None:
-        """``frequency`` ω [rad/s] and ``damping_ratio`` ζ; at a time step Δt keep ω Δt below about 0.1.
+        """``frequency`` ω [rad/s], ``damping_ratio`` ζ; keep ω Δt of a time step below about 0.1.
 
         Raises ``InputError`` if one is negative or not finite.
         """
@@ -136,11 +136,11 @@ class JointImpedance:
         self._latest: JointSprings | None = None
 
     def springs(self, datas: Sequence[mujoco.MjData], others: Sequence[int] = ()) -> JointSprings:
-        """The same springs for states that are driven in every step; ``others``: actuators that are commanded beside the motors."""
+        """The same springs, driven in every step; ``others``: actuators beside the motors."""
         return JointSprings(self.arm, datas, frequency=self._frequency, damping_ratio=self._ratio, others=others)
 
     def torque(self, data: mujoco.MjData, joints: np.ndarray, velocity: np.ndarray | None = None) -> JointTorque:
-        """Torques towards positions ``joints`` (n,) [rad] that move with ``velocity`` (n,) [rad/s]; None: 0.
+        """Torques towards ``joints`` (n,) [rad] that move with ``velocity`` [rad/s]; None: 0.
 
         Raises ``InputError`` for a wrong shape or a number that is not finite.
         """

@@ -1,4 +1,4 @@
-"""Springs in the joints of one arm in B states: aimed once a control step, driven in every step of MuJoCo by three kernels."""
+"""Springs in the joints of one arm in B states: aimed by control step, driven every step."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class JointSprings:
         return self._reader.reads(datas)
 
     def aim(self, joints: np.ndarray, speed: np.ndarray, start: np.ndarray, others: np.ndarray | float = 0.0) -> None:
-        """Set targets ``joints`` (B, n) at the times ``start`` (B,) [s], which move with ``speed`` (B, n).
+        """Set targets ``joints`` (B, n) at times ``start`` (B,) [s], moving with ``speed`` (B, n).
 
         ``others`` (B, k): controls of the other actuators.
         """

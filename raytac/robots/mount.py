@@ -1,4 +1,4 @@
-"""Mount a tactile sensor on a body or a site of any MJCF robot, and find the sensors of a compiled model again."""
+"""Mount tactile sensors on bodies or sites of a robot; find those of a compiled model."""
 
 from __future__ import annotations
 
@@ -23,19 +23,20 @@ from raytac.specs.sensor import GelpadSpec, SensorSpec
 from raytac.specs.sensor_file import sensor_spec
 
 _WALL = 0.8e-3
-"""Thickness of a case's walls and back [m]: a guess, with which the Mini's inside gives its outside of 32 × 28 mm."""
+"""Thickness of a case's walls and back [m]: a guess, from the Mini's outside of 32 × 28 mm."""
 _CASE_DENSITY = 1000.0
-"""Mean density of a case with its camera [kg/m³]: a guess, by which the GelSight Mini weighs 22 g without its gel."""
+"""Mean density of a case with its camera [kg/m³]: a guess; the Mini without gel weighs 22 g."""
 _MARK = "raytac:"
-"""A sensor leaves a custom text of this name and its own in the model, which holds the name or path of its file. The text outlives
-``MjSpec.compile``, ``to_xml`` and ``attach``, whose prefix it then carries."""
+"""Prefix of a sensor's custom text in the model, which holds the name or path of its file.
+
+The text outlives ``MjSpec.compile``, ``to_xml`` and ``attach``, whose prefix it then carries."""
 _IN_CODE = "made in code"
 """Text of a sensor that was mounted as a specification, which no file has."""
 _TOUCH_RADIUS = 3e-3
-"""Contact radius [m] and mass [kg] for which MuJoCo's own contact of a gel is as stiff as the gel (a guess: a finger's tip, a cube)."""
+"""Contact radius [m] and mass [kg] of MuJoCo's contact, as stiff as the gel there (a guess)."""
 _TOUCH_MASS = 0.05
 _FARTHEST, _HEAVIEST = 1.0, 5.0
-"""Distance from the carrier [m] and mass of a sensor [kg] beyond which millimetres or grams are likely: GelSights weigh 20 to 200 g."""
+"""Distance from the carrier [m] and mass [kg] of mistaken units; GelSights: 20 to 200 g."""
 
 
 @dataclass(frozen=True)
@@ -46,13 +47,13 @@ class MountedSensor:
     body: str
     """Body whose frame is the pad frame; a wrench on the pad acts on it (``xfrc_applied``)."""
     site: str
-    """Site at the pad frame: origin at the centre of the undeformed outer surface, +z out of the sensor."""
+    """Site at the pad frame: centre of the undeformed outer surface, +z out of the sensor."""
     case: str
     """Geom of the case; it collides."""
     gel: str
-    """Geom of the gel block. It collides only where ``mount`` was told so, since the pad's physics computes its contact."""
+    """Geom of the gel block; it collides only with ``mount(collide=True)``."""
     nominal: str
-    """Site at the pad as designed, on the body that carries the sensor: it stays there when a world mounts the pad with an error."""
+    """Site at the pad as designed, on its carrier: a world may mount the pad with an error."""
     spec: SensorSpec
     """The sensor."""
 
@@ -74,7 +75,7 @@ class RobotModel:
     spec: mujoco.MjSpec
     sensors: tuple[MountedSensor, ...]
     site: str
-    """Site that the joints move: the one sensor's ``nominal``, or the midpoint of two pads, where z is the direction of the fingers."""
+    """Site that the joints move: a sensor's ``nominal``; midway of two pads, z along fingers."""
     opening: str | None
     """Position actuator of the gap between two pads [m]; None without a gripper."""
     joints: tuple[str, ...]
@@ -87,7 +88,7 @@ def case_depth(sensor: SensorSpec) -> float:
 
 
 def standing_on(sensor: SensorSpec) -> np.ndarray:
-    """``mount_from_pad`` (4, 4) of a sensor whose back stands on the mount's origin, axes parallel: the pad looks along the mount's +z."""
+    """``mount_from_pad`` (4, 4): the back on the mount's origin, the pad looking along its +z."""
     return rigid(np.eye(3), np.array([0.0, 0.0, case_depth(sensor)]))
 
 
@@ -102,7 +103,7 @@ def mount(
     mass: float | None = None,
     collide: bool = False,
 ) -> MountedSensor:
-    """Put a sensor on a robot, rigidly: a body at the pad frame with the case, the gel block and a site.
+    """Put a sensor on a robot, rigidly: a body at the pad frame with case, gel block and site.
 
     .. code-block:: python
 
@@ -305,7 +306,7 @@ def _sensor_model(
 
 
 def _let_collide(gel: mujoco.MjsGeom, gelpad: GelpadSpec) -> None:
-    """Give a gel block MuJoCo's contact: 2 E* a of a flat punch of radius a, for a body of the mass m, and Coulomb's friction.
+    """Give a gel block MuJoCo's contact: friction, and 2 E* a of a flat punch under a mass m.
 
     In MuJoCo's form by time constant T and impedance d a contact of the mass m is a spring of K = m / ((1 − d) d² T²) at rest.
     """

@@ -1,4 +1,4 @@
-"""Places of MuJoCo's arrays in memory, so that kernels read and write the states of all environments without a call for each.
+"""Places of MuJoCo's arrays in memory, for kernels that read and write many states at once.
 
 MuJoCo's contacts and constraint rows lie in an arena, where they move from step to step. Python gets each of them by a call of its own,
 which for many environments takes longer than MuJoCo's own step. The pointers to them are in the structure ``mjData`` itself, whose
@@ -61,11 +61,7 @@ def _size(declared: Any) -> tuple[int, int]:
 
 @functools.cache
 def checked_layouts() -> tuple[Layout, Layout]:
-    """Layouts of ``mjData`` and ``mjContact``.
-
-    Raises:
-        BackendError: this MuJoCo keeps its states otherwise than it declares.
-    """
+    """Layouts of ``mjData`` and ``mjContact``; ``BackendError`` if MuJoCo's differ."""
     state, contact = layout("mjData"), layout("mjContact")
     model = mujoco.MjModel.from_xml_string(_BALLS)
     data = mujoco.MjData(model)

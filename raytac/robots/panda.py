@@ -1,4 +1,4 @@
-"""The Franka Panda: our own model from ``scenes/robots``, or the menagerie's, with tactile sensors on it.
+"""The Franka Panda, our model or the menagerie's, with tactile sensors on it.
 
 Kinematics, limits and inertias with their sources: docs/robots.md and the comments of ``scenes/robots/panda.xml``.
 """
@@ -30,11 +30,11 @@ READY: Final = (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math
 """Joint positions [rad] from which libfranka's examples start: the flange looks down."""
 
 _FLANGE: Final = (0.0, 0.0, 0.107)
-"""The flange in the frame of link7 [m] (Franka Control Interface documentation, Denavit-Hartenberg parameters)."""
+"""The flange in the frame of link7 [m] (Franka Control Interface, Denavit-Hartenberg)."""
 _HAND_TURN: Final = -math.pi / 4
 """The hand on the flange, about z [rad] (franka_ros, panda_arm_hand.urdf.xacro)."""
 _TCP: Final = 0.1034
-"""Point between the finger tips in the hand's frame, along z [m] (franka_ros, franka_hand.xacro)."""
+"""Point between the finger tips along z of the hand [m] (franka_ros, franka_hand.xacro)."""
 _FINGER: Final = 0.0584
 """Finger frames in the hand's frame, along z [m] (the same)."""
 
@@ -66,7 +66,7 @@ def one_sensor_panda(sensor: SensorSpec | str = "gelsight_mini", *, model: str |
 
 
 def two_finger_panda(sensor: SensorSpec | str = "gelsight_mini", *, model: str | Path | None = None) -> RobotModel:
-    """A Panda with the Franka Hand whose fingers are two sensors, ``left`` and ``right``, pads facing each other.
+    """A Panda with the Franka Hand; two sensors that face each other, ``left`` and ``right``.
 
     Holders replace the finger tips. A pad's centre lies where the touching plane of the tip was, 0.1034 m in front of the hand's
     flange; its x is the finger's x, its y points to the finger's end. The gap between both pads is the sum of the finger joints,
@@ -130,7 +130,7 @@ def _arm(model: str | Path | None) -> mujoco.MjSpec:
 
 
 def _replace_servo(spec: mujoco.MjSpec) -> None:
-    """Replace the actuators of another model's hand by our servo on the sum of both finger joints."""
+    """Replace the actuators of a model's hand by our servo on the sum of both finger joints."""
     for actuator in list(spec.actuators):
         if actuator.target not in JOINTS:
             spec.delete(actuator)

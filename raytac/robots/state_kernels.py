@@ -14,7 +14,7 @@ _MANY = wp.constant(0x7FFFFFFF)
 
 @wp.struct
 class Entries:
-    """Places of numbers in B states, and in the result. (One structure is handed to a kernel sooner than six arrays.)"""
+    """Places of numbers in B states, and in the result, as one structure, which launches faster."""
 
     places: wp.array2d(dtype=wp.uint64)
     """Addresses (B, members) of arrays of float64."""
@@ -46,7 +46,7 @@ def write_numbers(
     values: wp.array2d(dtype=wp.float64),
     chosen: wp.array(dtype=wp.int32),
 ):
-    """Copy ``values`` (B, n) to entries of the arrays at ``places`` (B,) of environments that are ``chosen``."""
+    """Copy ``values`` (B, n) to entries of the arrays at ``places`` (B,) where ``chosen``."""
     env, k = wp.tid()
     if chosen[env] != 0:
         target = wp.array(ptr=places[env], shape=(_MANY,), dtype=wp.float64)

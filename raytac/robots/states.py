@@ -1,4 +1,4 @@
-"""Numbers of many states of MuJoCo at once: read into arrays over environments, and written back, by one kernel each.
+"""Numbers of many states of MuJoCo at once: read and written by one kernel each.
 
 MuJoCo keeps every state in memory of its own, and a call from Python for each number of each state takes longer than its own step. The
 arrays that are named here stay where they are as long as the state lives, so that their places are looked up once.
@@ -36,7 +36,7 @@ class Numbers:
 
 
 def numbers(name: str, index: np.ndarray) -> Numbers:
-    """Entries ``index`` (…) of a member of ``MjData``, as a flat array, or of ``time``; 0 where an index is negative."""
+    """Entries ``index`` (…) of a flat member of ``MjData``, or of ``time``; 0 where negative."""
     flat = np.asarray(index, int).ravel().tolist()
     return Numbers(tuple(name if i >= 0 else "" for i in flat), tuple(max(i, 0) for i in flat), np.shape(index))
 
@@ -139,12 +139,8 @@ class ControlWriter:
         inputs = [places, wp.array(list(actuators), dtype=wp.int32, device="cpu"), self.controls, self._chosen]
         self._write = Recorded(partial(wp.launch, write_numbers, dim=self.controls.shape, inputs=inputs, device="cpu"))
 
-    def writes(self, datas: Sequence[mujoco.MjData]) -> bool:
-        """True if it writes to these states."""
-        return same_states(datas, self._datas)
-
     def write(self, envs: Sequence[int] | np.ndarray) -> np.ndarray | None:
-        """Write the controls of environments; returns those of the first one in which they are not finite, and writes nothing then."""
+        """Write the controls of environments; or return the first that are not finite, writing none."""
         chosen = self._values if len(envs) == len(self._datas) else self._values[envs]
         # One number that is not finite makes the sum such.
         if not np.isfinite(chosen.sum()):

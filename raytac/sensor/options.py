@@ -28,19 +28,13 @@ SHAPE_TOLERANCE = 0.02
 
 
 def sensor_outputs(optics: str | OpticsConfig[Any] | type[OpticsConfig[Any]]) -> tuple[str, ...]:
-    """Outputs that a sensor offers with an optical mode.
-
-    All of ``OUTPUTS`` but those that only other modes make.
-    """
+    """Outputs of a sensor with an optical mode: all but those that only other modes make."""
     made = (OPTICS.config_class(optics) if isinstance(optics, str) else optics).outputs
     return tuple(name for name in OUTPUTS if name not in OPTICAL_OUTPUTS or name in made)
 
 
 def checked_outputs(outputs: Sequence[str] | str, optics: OpticsConfig[Any]) -> tuple[str, ...]:
-    """The names in the order of ``OUTPUTS``.
-
-    Raises ``InputError`` for one that is unknown or that ``optics`` does not make.
-    """
+    """Names in the order of ``OUTPUTS``; ``InputError`` if unknown, or not made by ``optics``."""
     if outputs == "markers" or (isinstance(outputs, (list, tuple)) and "markers" in outputs):
         raise InputError("outputs", value=outputs, rule="markers are asked for by the argument markers, as in markers='fots'")
     if outputs == "force" or (isinstance(outputs, (list, tuple)) and "force" in outputs):
@@ -53,10 +47,7 @@ def checked_outputs(outputs: Sequence[str] | str, optics: OpticsConfig[Any]) -> 
 
 
 def checked_markers(markers: str | MarkersConfig | None, physics: PhysicsConfig | None) -> MarkersConfig | None:
-    """Configuration of the marker model.
-
-    Raises ``InputError`` for an unknown one, or one that needs what the physics does not have.
-    """
+    """Configuration of the marker model; ``InputError`` if unknown, or not for this physics."""
     config = None if markers is None else markers_config(markers)
     if config is not None and config.needs_coat and physics is not None and not physics.is_simulated:
         rule = f"tracks the surface of a soft pad; physics={physics.label!r} has none"
@@ -85,10 +76,7 @@ def press_scene(scene: str | Path | PressScene) -> PressScene:
 
 
 def warn_of_other_shape(resolution: tuple[int, int], native: tuple[int, int]) -> None:
-    """Warn of an image of another shape than the sensor's: its pixels are not square.
-
-    The field of view is the sensor's.
-    """
+    """Warn of an image of another shape than the sensor's view: its pixels are not square."""
     stretch = (resolution[0] / native[0]) / (resolution[1] / native[1])
     if abs(stretch - 1.0) > SHAPE_TOLERANCE:
         (width, height), (w, h) = resolution, native

@@ -1,7 +1,4 @@
-"""``TactileSensor``: one sensor, one physics, one optical mode.
-
-A press or a surface goes in, a ``TactileFrame`` comes out.
-"""
+"""``TactileSensor``: one sensor, physics and optical mode; a press in, a frame out."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,23 +21,14 @@ from raytac.markers.base import MarkersConfig
 from raytac.markers.pattern import MarkerPattern, dot_ink
 from raytac.markers.registry import MARKERS
 from raytac.markers.tracker import MarkerFrame, MarkerTracker
-from raytac.optics.base import OPTICAL_OUTPUTS, BuiltOptics, OpticsImages, start
+from raytac.optics.base import OPTICAL_OUTPUTS, BuiltOptics, OpticalMode, OpticsConfig, OpticsImages, start
 from raytac.optics.registry import chosen_optics
 from raytac.physics.base import Pad, PadReading, PhysicsConfig
 from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
 from raytac.physics.soft.contact_width import cells_across, holds_force, warn_if_narrow
-from raytac.sensor.options import (
-    checked_markers,
-    checked_outputs,
-    checked_resolution,
-    press_scene,
-    warn_of_other_shape,
-)
+from raytac.sensor.options import checked_markers, checked_outputs, checked_resolution, press_scene, warn_of_other_shape
 from raytac.specs import PressScene, SensorSpec, press_of, validate_press
 from raytac.specs.sensor_file import sensor_spec
-
-if TYPE_CHECKING:
-    from raytac.optics.base import OpticalMode, OpticsConfig
 
 
 class TactileSensor:
@@ -162,18 +150,12 @@ class TactileSensor:
 
     @property
     def sampling(self) -> dict[str, int | float | str]:
-        """``integrator``, ``spp`` and ``exposure`` of the optical mode, for headers and reports.
-
-        Empty without images or rays.
-        """
+        """``integrator``, ``spp``, ``exposure`` of the optical mode; empty without images or rays."""
         return getattr(self.optical_mode, "sampling", {}) if self._optical_outputs else {}
 
     @property
     def device_used(self) -> str:
-        """``cpu`` or ``cuda``: where images are made.
-
-        Without images where a soft pad is solved, and ``cpu`` for a rigid one.
-        """
+        """``cpu`` or ``cuda``: where images are made; without images, where a soft pad is solved."""
         if self._optical_outputs:
             return self.optical_mode.device
         return resolve_device(self.device, ray_tracing=False) if self._used.is_simulated else "cpu"
@@ -192,15 +174,11 @@ class TactileSensor:
         progress: bool = False,
         **own: Any,
     ) -> TactileFrame:
-        """Run the scene's trajectory and return the frame at its peak.
-
-        That is the end of the last stage that is not a release.
+        """Run the scene's trajectory; frame at its peak: the end of the last stage but a release.
 
         A mesh file or an array of heights [m] is pressed in to ``depth`` [m]; ``scale`` [m per file unit] and ``pitch`` [m] as in
-        ``raytac.specs.press_of``.
-
-        ``own``: what environments do each in their own way, as ``load`` takes it. ``progress``: a soft pad, which takes seconds to
-        minutes, shows its stages and the solver's steps in a bar on standard error, if that is a terminal.
+        ``raytac.specs.press_of``. ``own``: settings by environment, as ``load`` takes them. ``progress``: a soft pad, which takes
+        seconds to minutes, shows its stages and the solver's steps in a bar on standard error, if that is a terminal.
 
         Raises:
             InputError: an argument of ``load`` of the wrong shape or out of range.
@@ -226,9 +204,7 @@ class TactileSensor:
         twists: np.ndarray | None = None,
         seeds: Sequence[int] | None = None,
     ) -> Pad:
-        """Put the scene's object before this sensor, and return the physics.
-
-        A loop can step it and call ``update``.
+        """Put the scene's object before this sensor, and return the physics, which a loop can step.
 
         Args:
             scene: name of a shipped press scene, path of a scene file, or a scene.
@@ -272,8 +248,7 @@ class TactileSensor:
         """Frame of a pad's reading, in a press of ``load`` or in a world, or of a gel surface.
 
         With markers, call it for every reading in order: some models follow the object since first touch (``reset_markers`` forgets).
-
-        ``envs``: which environment each row of a surface or a reading is of, so that only their markers go on; None is all.
+        ``envs``: environment of each row of a surface or a reading, so that only their markers go on; None is all.
 
         Raises:
             InputError: neither of both, a reading of another scene than was loaded last, a surface of another sensor's pad; ``envs``
@@ -305,10 +280,7 @@ class TactileSensor:
         return self._frame(surface, markers, done, time_ms, **forces)
 
     def _forces(self, reading: PadReading) -> dict[str, Any]:
-        """Fields of a frame about forces, as far as they are asked for; none of a bare surface.
-
-        With ``wrench`` or ``traction`` come ``contact_area`` and, of a surface with a mesh, ``contact_cells``.
-        """
+        """Fields of a frame about forces, as far as they are asked for; none of a bare surface."""
         if not reading.has_forces:
             return {}
         surface, failed = reading.surface, reading.failed
@@ -327,11 +299,9 @@ class TactileSensor:
         return outputs
 
     def _check_width(self, state: PadReading, cells: np.ndarray) -> None:
-        """Warn once a press of a contact that the pad's cells cannot resolve.
+        """Warn once a press of a contact too narrow for the pad's cells, as a stage to a depth ends.
 
-        Only where a stage to a depth ends.
-
-        On the way every contact is narrow once, so what lies between the ends of stages is not looked at.
+        Between the ends of stages every contact is narrow once.
         """
         if state.stage < 0:
             self._is_narrow = False  # a press begins
@@ -389,9 +359,7 @@ class TactileSensor:
     def reset_markers(self, envs: np.ndarray | list[int] | None = None) -> None:
         """Forget the history of the markers of environments, and draw their placement again.
 
-        ``envs``: a mask (B,), a list, or None for all.
-
-        ``load`` and ``press`` do it for all.
+        ``envs``: a mask (B,), a list, or None for all. ``load`` and ``press`` do it for all.
 
         Raises:
             InputError: no marker model was asked for, or an environment that does not exist.

@@ -91,10 +91,7 @@ def primitive(kind: str, size: tuple[float, ...] = (), object_from_part: np.ndar
 
 
 def mesh_part(vertices: np.ndarray, faces: np.ndarray, object_from_part: np.ndarray | None = None) -> Part:
-    """A triangle mesh; a watertight one that is inside out is turned.
-
-    Raises ``InputError`` for bad arrays.
-    """
+    """A triangle mesh; a watertight one is turned right side out. ``InputError`` for bad arrays."""
     vertices = check_numbers("vertices", vertices, (None, 3))
     faces = check_numbers("faces", faces, (None, 3), finite=True).astype(np.int64)
     far = ~(np.abs(vertices) <= _LONGEST).all(axis=1)

@@ -31,10 +31,7 @@ def line_in_part(pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[list[n
 
 
 def bounds(kind: str, size: tuple[float, ...], pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Axis-aligned box (lower, upper) [m] that holds the primitive at poses (…, 4, 4).
-
-    Each (…, 3), pad frame.
-    """
+    """Box (lower, upper) [m], each (…, 3), pad frame, of the primitive at poses (…, 4, 4)."""
     rotation, centre = pose[..., :3, :3], pose[..., :3, 3]
     axis = rotation[..., :, 2]
     across = np.sqrt(np.clip(1.0 - axis**2, 0.0, None))

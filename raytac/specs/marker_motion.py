@@ -1,7 +1,4 @@
-"""Motion of a pad's markers under a load, as in ``scenes/markers/``.
-
-``raytac calibrate markers`` fits it.
-"""
+"""Motion of a pad's markers under load (``scenes/markers/``), which a calibration fits."""
 
 from __future__ import annotations
 

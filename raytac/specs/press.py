@@ -103,10 +103,7 @@ class ObjectSpec:
 
 @dataclass(frozen=True)
 class StageSpec:
-    """One stage of the trajectory.
-
-    Targets are absolute, measured from first touch at zero shear and twist.
-    """
+    """One stage of the trajectory; targets count from first touch at zero shear and twist."""
 
     kind: str
     """``indent shear twist release``."""

@@ -191,10 +191,7 @@ class CameraSpec:
 
 @dataclass(frozen=True)
 class ResponseSpec:
-    """From linear radiance L to an 8-bit value.
-
-    u8 = 255 · clip(wb · exposure · vignette · shading · L + black)^(1/γ).
-    """
+    """u8 = 255 · clip(wb · exposure · vignette · shading · L + black)^(1/γ) of a radiance L."""
 
     exposure: float | Literal["auto"]
     """Gain from radiance [W/(m² sr), relative] to full scale 1; ``AUTO``: rest is mid-grey.
@@ -220,11 +217,7 @@ class ResponseSpec:
 
     @property
     def gain(self) -> float:
-        """The exposure as a number.
-
-        Raises:
-            SpecError: it is ``AUTO``, and nobody has rendered the image at rest (``raytac.optics.trace.fast_tracer.with_exposure``).
-        """
+        """The exposure as a number; ``SpecError`` for ``AUTO``, which ``with_exposure`` replaces."""
         if self.exposure == AUTO:
             raise SpecError("must be a number here: with_exposure finds it", key="response.exposure", value=AUTO)
         return self.exposure
@@ -241,10 +234,7 @@ class ResponseSpec:
 
 
 def shading_degree(count: int) -> int:
-    """Highest degree n of a colour shading of ``count`` coefficients; −1 for none.
-
-    A degree n has (n + 1)(n + 2)/2 coefficients.
-    """
+    """Degree n of a shading with (n + 1)(n + 2)/2 coefficients, at most ``count``; −1 for none."""
     return (math.isqrt(8 * count + 1) - 3) // 2
 
 

@@ -47,10 +47,7 @@ def load_sensor(name_or_path: str | Path) -> SensorSpec:
 
 
 def sensor_spec(sensor: str | Path | SensorSpec) -> SensorSpec:
-    """The specification itself, or that of a name or file.
-
-    Raises ``InputError`` or ``SpecError``.
-    """
+    """The specification itself, or of a name or file. Raises ``InputError`` or ``SpecError``."""
     if not isinstance(sensor, (str, Path, SensorSpec)):
         raise InputError("sensor", value=sensor, rule=f"must be a name, a path or a SensorSpec, not {type(sensor).__name__}")
     if not isinstance(sensor, SensorSpec):
@@ -60,10 +57,7 @@ def sensor_spec(sensor: str | Path | SensorSpec) -> SensorSpec:
 
 
 def _read_sensor(path: Path, above: tuple[Path, ...] = ()) -> SensorSpec:
-    """A sensor file, or ``base`` with the tables and files of this one in place of its own.
-
-    ``above``: files that are built on this one.
-    """
+    """A sensor file, or ``base`` with this one's tables; ``above``: files built on this one."""
     top = read_toml(path)
     parts = {name: schema for name, schema in SENSOR_SCHEMA.items() if name}
     base = None
@@ -140,10 +134,7 @@ def _read_led(table: Table) -> LedSpec:
 
 
 def lights_text(lights: LightsSpec, comment: str) -> str:
-    """A light file: ``comment``, its lines marked with #, then one table an LED.
-
-    Millimetres to 10 µm, powers to four digits.
-    """
+    """A light file: ``comment``, then a table an LED; lengths to 10 µm, powers to four digits."""
 
     def row(values: tuple[float, ...], scale: float, digits: str) -> str:
         return ", ".join(f"{scale * value:{digits}}" for value in values)
@@ -158,10 +149,7 @@ def lights_text(lights: LightsSpec, comment: str) -> str:
 
 
 def response_text(response: ResponseSpec) -> str:
-    """The table ``[response]`` to six digits, colour shading to four decimals.
-
-    Shading has one line for each order in x.
-    """
+    """The table ``[response]`` to six digits; shading to four decimals, a line an order in x."""
 
     def row(values: tuple[float, ...]) -> str:
         return "[" + ", ".join(f"{value:.6g}" for value in values) + "]"

@@ -115,8 +115,7 @@ def _check_lengths(kind: str, p: Mapping[str, Any], prefix: str, file: Path | No
     elif kind == "coin" and p["relief_height"] >= p["thickness"]:
         key, rule = "relief_height_mm", f"must be less than thickness_mm = {in_mm(p['thickness'])}"
     if key:
-        dotted = f"{prefix}.{key}" if prefix else key
-        raise SpecError(rule, file=file, key=dotted, value=in_mm(p[key.removesuffix("_mm")]))
+        raise SpecError(rule, file=file, key=f"{prefix}.{key}" if prefix else key, value=in_mm(p[key.removesuffix("_mm")]))
 
 
 def _check_mesh(table: Table, values: Mapping[str, Any]) -> None:

@@ -1,7 +1,4 @@
-"""Task scenes: a robot that carries sensors, bodies around it, steps. SI, world frame.
-
-World frame: base of the arm, z up, x ahead.
-"""
+"""Task scenes: robot with sensors, bodies, steps. SI; world frame: arm's base, z up, x on."""
 
 from __future__ import annotations
 

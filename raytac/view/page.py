@@ -34,10 +34,7 @@ _AXES = ("x", "y", "z")
 
 
 class Page:
-    """All that is seen in the browser; clients share it.
-
-    ``show`` is for the player, the rest reacts to users.
-    """
+    """All that the browsers show; ``show`` is for the player, the rest reacts to users."""
 
     def __init__(self, server: ViserServer, session: Session) -> None:
         """Build the page; it stays still until ``attach`` ties it to a player."""

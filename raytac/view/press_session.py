@@ -46,10 +46,7 @@ _OBJECT_COLOUR = (150, 156, 166)
 
 
 class PressSession:
-    """One sensor and the object of a press scene (see ``Session``).
-
-    The world frame is the pad frame.
-    """
+    """One sensor and the object of a press (see ``Session``); the world frame is the pad frame."""
 
     units_per_metre = 100.0
     is_driven_at_rest = True

@@ -41,10 +41,7 @@ QUANTITIES = {
 
 @dataclass(frozen=True)
 class Control:
-    """A number that a slider sets.
-
-    ``low``, ``high``, ``step`` and the values handed over are in the unit of the label.
-    """
+    """A number that a slider sets; all its values are in the unit of the label."""
 
     name: str
     label: str
@@ -90,10 +87,7 @@ def round_up(value: float) -> float:
 
 @dataclass(frozen=True)
 class Solid:
-    """A triangle mesh, made once.
-
-    ``Snapshot.poses`` places it, or ``Snapshot.reshaped`` deforms it.
-    """
+    """A triangle mesh, made once; ``Snapshot.poses`` or ``reshaped`` places or deforms it."""
 
     name: str
     """Unique among solids; slashes make a tree."""
@@ -177,10 +171,7 @@ class CameraPlace:
 
 
 class Session(Protocol):
-    """Something that can be played, stepped, driven and drawn.
-
-    One thread alone calls its methods, one at a time.
-    """
+    """Something to play, step, drive and draw; one thread alone calls it, one call at a time."""
 
     title: str
     """One line: scene, sensor, physics and optics."""

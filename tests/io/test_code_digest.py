@@ -12,13 +12,13 @@ from raytac.io.code_digest import code_digest, module_sources
 def test_code_of_a_mode_is_all_that_it_imports() -> None:
     names = set(module_sources(["raytac.optics.trace.fast_tracer"]))
     assert {
-        "raytac.optics.trace.direct",
+        "raytac.optics.trace.interreflection",
         "raytac.optics.trace.reference",
         "raytac.optics.response",
         "raytac.gel.surface",
     } <= names
     assert all(name.startswith(("raytac.optics", "raytac.gel")) for name in names)
-    assert "raytac.optics.trace.direct" not in module_sources(["raytac.optics.trace.reference"])
+    assert "raytac.optics.trace.fast_tracer" not in module_sources(["raytac.optics.trace.reference"])
     assert not module_sources(["raytac.optics.no_such_module"])
 
 
@@ -26,8 +26,8 @@ def test_code_of_a_table_is_that_of_its_bake_and_not_of_the_mode_that_uses_it() 
     baked, used = (set(module_sources([f"raytac.optics.taxim.{name}"])) for name in ("bake.bake", "mode"))
     assert {
         "raytac.gel.pyramid",
-        "raytac.shapes.rasterize",
-        "raytac.optics.trace.direct",
+        "raytac.shapes.underside",
+        "raytac.optics.trace.fast_tracer",
         "raytac.optics.taxim.bake.shadow",
     } <= baked
     assert not {"raytac.optics.taxim.mode", "raytac.optics.taxim.shadow", "raytac.optics.image.phong"} & baked

@@ -12,8 +12,8 @@ from raytac.device import cuda_missing
 from raytac.errors import BackendError, InputError
 from raytac.gel.surface import GelSurface
 from raytac.optics import RayTraced
-from raytac.optics.trace.denoise import make_denoiser
 from raytac.optics.trace.fast_tracer import total
+from raytac.optics.trace.sampled_tracer import make_denoiser
 from tests.optics.conftest import Build
 from tests.optics.images import errors
 from tests.optics.scenes import RESOLUTION, ball, grid_of, like_a_mini, surface

@@ -103,10 +103,12 @@ def test_other_code_is_another_key(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     asked = SPEC, BakeSettings(), 0, (320, 240)
     before = table_cache.table_key(*asked)
     assert before == table_cache.table_key(*asked)
-    changed = tmp_path / "fast.py"
+    changed = tmp_path / "fast_tracer.py"
     changed.write_text("changed = True\n")
     sources = code_digest.module_sources
-    monkeypatch.setattr(code_digest, "module_sources", lambda roots: sources(roots) | {"raytac.optics.trace.direct": changed})
+    monkeypatch.setattr(
+        code_digest, "module_sources", lambda roots: sources(roots) | {"raytac.optics.trace.fast_tracer": changed}
+    )
     assert table_cache.table_key(*asked) != before
 
 

@@ -16,9 +16,8 @@ from raytac.physics.objects import object_parts
 from raytac.physics.soft.bodies import object_body, scene_body
 from raytac.physics.soft.mesh import PAD_LEVELS, PadMesh, pad_mesh
 from raytac.shapes.part import mesh_part, primitive
-from raytac.shapes.rasterize import lowest_of_triangles
 from raytac.shapes.triangulate import object_surface, part_surface
-from raytac.shapes.underside import object_height
+from raytac.shapes.underside import lowest_of_triangles, object_height
 from raytac.specs import load_press, load_sensor
 from raytac.specs.files import available
 from raytac.specs.press import PADS

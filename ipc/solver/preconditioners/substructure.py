@@ -85,11 +85,7 @@ def partition(layout: Layout, nodes: Ints, parts: int) -> Ints:
 
 
 def _single(inverse: NDArray[np.floating]) -> Singles:
-    """An inverse in single precision.
-
-    Raises:
-        numpy.linalg.LinAlgError: if that rounding makes it indefinite.
-    """
+    """An inverse in single precision; ``LinAlgError`` if rounding makes it indefinite."""
     single = (0.5 * (inverse + inverse.T)).astype(np.float32)
     np.linalg.cholesky(single.astype(np.float64))
     return single

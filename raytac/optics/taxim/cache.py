@@ -1,4 +1,4 @@
-"""Baked tables on disk, each under a digest of all that shapes it, so that a table is never taken for that of another sensor or code."""
+"""Baked tables on disk, each under a digest of all that shapes it, code included."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ CHECKSUMS = "SHA256SUMS"
 
 
 def table_key(sensor: SensorSpec, settings: BakeSettings, seed: int, resolution: tuple[int, int]) -> str:
-    """Digest of sensor and lights (not of where their files lie), settings, and the code that bakes; the device is not in it.
+    """Digest of sensor and lights (not of where their files lie), settings and baking code.
 
-    Nor are the markers: a table is baked on a plain coat, and sensors that differ in their dots alone share it.
+    Device and markers are not in it: sensors that differ in their dots alone share a table, which is baked on a plain coat.
     """
     plain = replace(
         sensor, source=None, name="", lights=replace(sensor.lights, source=None), marker_motion=None, markers=NO_MARKERS
@@ -56,7 +56,7 @@ def cached(folder: Path | None) -> PolyTable | None:
 
 
 def keep(table: PolyTable, folder: Path | None) -> bool:
-    """Write the table beside ``folder``, synchronise and rename it, in place of a damaged one; True if the table is there.
+    """Write the table beside ``folder``, synchronise and rename it; True if the table is there.
 
     A whole table that is there already stays, so that a reader never finds half of it: under one digest all are the same. Where the
     cache cannot be written there is none, with a warning.
@@ -102,7 +102,7 @@ def _save(table: PolyTable, folder: Path) -> None:
 
 
 def _load(folder: Path) -> PolyTable:
-    """The table of a folder of which every file agrees with its checksum; raises ``ValueError`` or ``OSError``."""
+    """The table of a folder, files checked by checksum; raises ``ValueError`` or ``OSError``."""
     lines = (line.partition("  ") for line in read_regular(folder / CHECKSUMS).decode().splitlines())
     listed = {name: digest for digest, _, name in lines}
     there = {path.name for path in folder.iterdir()} - {CHECKSUMS}

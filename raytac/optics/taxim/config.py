@@ -17,11 +17,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Taxim(OpticsConfig[Any]):
-    """A Taxim table: colour by a polynomial for each slope, shadows from a table; baked from the ray tracer unless one is given."""
+    """A Taxim table: colour by a polynomial for each slope, shadows from a table."""
 
     calibration: str | Path | PolyTable | None = None
-    """A table, a calibration folder, or None for the table baked from this sensor's own ray tracer, at first use unless it is kept from
-    before. The sensor's lights matter only then. The table's image is laid over the whole image."""
+    """A table, a calibration folder, or None: baked from this sensor's ray tracer at first use.
+
+    The sensor's lights matter only then. The table's image is laid over the whole image."""
     shadows: bool | None = None
     """Cast shadows; None is as the sensor says, where the table has them."""
 

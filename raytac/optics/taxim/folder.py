@@ -102,7 +102,7 @@ def processed_background(f0: np.ndarray, constants: TaximConstants) -> np.ndarra
 
 
 def _blur_matrix(n: int, sigma: float) -> np.ndarray:
-    """(n, n): Gaussian cut at 4 σ on n pixels whose border repeats mirrored, edge pixel included."""
+    """(n, n): Gaussian cut at 4 σ on n pixels, mirrored at the border, edge pixel included."""
     radius = int(4 * sigma + 0.5)
     offset = np.arange(-radius, radius + 1)
     weights = np.exp(-0.5 * (offset / sigma) ** 2)
@@ -198,7 +198,7 @@ def _numbers(path: Path, place: tuple[int, ...], row: Any) -> np.ndarray:
 
 
 def save_calibration(table: PolyTable, folder: str | Path) -> None:
-    """Write ``table`` as a calibration folder that ``load_calibration`` gives back and that the package ``taxim`` reads."""
+    """Write ``table`` as a folder for ``load_calibration`` and for the package ``taxim``."""
     rest = np.clip(np.rint(table.background), 0, 255).astype(np.uint8) if table.rest_image is None else table.rest_image
     with result_folder(Path(folder), CALIBRATION_FILES) as work:
         for_one = table.gradients if table.one_sheet is None else table.one_sheet

@@ -1,4 +1,4 @@
-"""The Taxim table as an optical mode: a polynomial by slope bin, optional shadows from a table, plus the image at rest.
+"""The Taxim table as an optical mode: a polynomial by slope bin, shadows, the image at rest.
 
 Si and Yuan, Taxim, RA-L 2022, sections III-B and III-C; semantics of their released simulator (docs/taxim-table.md lists what is kept
 as it is, oddities included, and what differs). Deformation is not in here: the physics gives the surface.
@@ -36,7 +36,7 @@ class TableArrays:
     """Device arrays of a table: what a recorded frame reads besides the surface."""
 
     bins: Any
-    """20 floats a bin: 6 coefficients of each channel, whether it is covered, and one unused; all bins of ``surround`` follow."""
+    """20 floats a bin: 6 coefficients a channel, covered, one unused; ``surround`` follows."""
     background: Any
     """4 floats a pixel, the last unused."""
     shadow: ShadowArrays | None
@@ -46,7 +46,7 @@ class TableShader:
     """Shades height images by a table at one resolution; knows no camera and no pad."""
 
     def __init__(self, mi: Any, table: PolyTable, resolution: tuple[int, int], pitch: float, *, shadow: bool) -> None:
-        """``resolution`` (width, height) [px] may differ from the table's; ``pitch`` is that of an image pixel along x [m]."""
+        """``resolution`` [px] may differ from the table's; ``pitch`` of an image pixel along x [m]."""
         self.mi, self.table, self.resolution = mi, table, resolution
         self.scale = (table.resolution[0] / resolution[0], table.resolution[1] / resolution[1])
         """Calibration pixels per image pixel along x and y."""
@@ -62,9 +62,9 @@ class TableShader:
         self.inputs = TableArrays(mi.Float(_packed_bins(table)), mi.Float(padded(background)), arrays)
 
     def levels(self, seen: ImageHeights, inputs: TableArrays) -> tuple[list[Float], UInt8]:
-        """Three channels of B·H·W levels, and flags of every pixel (UInt8): 1 in contact, ``_UNCOVERED`` more in an uncovered bin.
+        """Three channels of B·H·W levels, and flags of every pixel (UInt8).
 
-        The flags are one unused value where coverage is not known.
+        A flag is 1 in contact, ``_UNCOVERED`` more in an uncovered bin; one unused value where coverage is not known.
         """
         mi, table = self.mi, self.table
         displaced = table.slopes_of == "displacement"
@@ -109,7 +109,7 @@ class TableShader:
 
 
 class TaximMode(ImageMode):
-    """The optical mode ``taxim``: one sensor, one table, one resolution; batches of surfaces in, images out.
+    """The optical mode ``taxim``: one sensor, one table, one resolution.
 
     The table is loaded or baked by the constructor, which refuses a resolution of another shape than the table's image.
     """
@@ -140,7 +140,7 @@ class TaximMode(ImageMode):
 
     @property
     def view_ratio(self) -> tuple[float, float]:
-        """Width and height in view of the sensor over those of the table's image: 1 where they show the same piece of the pad."""
+        """Width and height in the sensor's view over those in the table's image."""
         sizes = zip(self.pitch, self.camera.resolution, self.table.pixel_pitch, self.table.resolution, strict=True)
         x, y = (p * n / (q * m) for p, n, q, m in sizes)
         return x, y
@@ -170,9 +170,9 @@ class TaximMode(ImageMode):
 
 
 def resized(image: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
-    """(H, W, 3) float32 resampled to ``resolution`` (width, height), pixel areas aligned; the image itself if it has that size.
+    """(H, W, 3) float32 resampled to ``resolution`` (width, height), pixel areas aligned.
 
-    Linear where it grows, a triangle over the covered pixels where it shrinks.
+    Linear where it grows, a triangle over the covered pixels where it shrinks; the image itself if it has that size.
     """
     if (image.shape[1], image.shape[0]) == resolution:
         return np.asarray(image, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""``params.json`` of a calibration folder: what is read of it, checked against the arrays, and how it is written."""
+"""``params.json`` of a calibration folder: read, checked against the arrays, and written."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _OWN: dict[str, Callable[[Any], bool]] = {
 
 
 def read_params(path: Path, pixel_pitch: float | None, n_bins: int, shape: tuple[int, ...]) -> CalibrationParams:
-    """Settings of ``params.json``, or upstream's own with ``pixel_pitch`` [m] where there is no such file.
+    """Settings of ``params.json``; without that file upstream's, with ``pixel_pitch`` [m].
 
     ``n_bins`` and ``shape`` (H, W, 3) are those of the arrays, which the file must agree with. Raises CalibrationError for a file that
     is missing, no JSON, or breaks a rule.
@@ -124,7 +124,10 @@ def _is_number(value: Any) -> bool:
 
 
 def params_of(table: PolyTable) -> dict[str, Any]:
-    """Content of ``params.json``: with it the package ``taxim`` blurs as the first release does (its own files have two widths swapped)."""
+    """Content of ``params.json``; the package ``taxim`` then blurs as its first release does.
+
+    (Its own files have two widths swapped.)
+    """
     width, height = table.resolution
     constants = table.constants
     shadow = table.shadow or ShadowTable(np.zeros(1), np.zeros((3, 1, 1, 1), np.float32), np.zeros((3, 1, 1), np.int32))

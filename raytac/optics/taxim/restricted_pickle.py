@@ -24,7 +24,7 @@ from raytac.errors import CalibrationError, RaytacError
 _NUMBERS = "biuf"
 """Kinds of NumPy numbers that are admitted."""
 _MOST_ITEMS = 2**22
-"""Items read at most; upstream's two tables have 12,205 and 24,561 levels. A list that stands in many places counts in each."""
+"""Items read at most, each use of a shared list counted; upstream's tables have 24,561."""
 _LARGEST_INT = 2**64
 _OPCODES = frozenset(
     """
@@ -39,7 +39,7 @@ _OPCODES = frozenset(
 
 
 def load_restricted(data: bytes) -> Any:
-    """Object of the pickle ``data``: numbers, lists, tuples, and NumPy arrays and scalars of them.
+    """Object of the pickle ``data``: numbers, lists, tuples, NumPy arrays and scalars of them.
 
     Raises UnpicklingError, before anything that it names has run, if it names or holds anything else, asks for far more memory than its
     own size, or is cut short or damaged.
@@ -54,7 +54,7 @@ def load_restricted(data: bytes) -> Any:
 
 
 def _check_program(data: bytes) -> None:
-    """Refuse instructions that are not needed, and places in the memo that would make it larger than the pickle."""
+    """Refuse instructions that are not needed, and a memo larger than the pickle."""
     for opcode, argument, _ in pickletools.genops(data):
         if opcode.name not in _OPCODES:
             raise pickle.UnpicklingError(f"it has the instruction {opcode.name}, which numbers, lists and arrays do not need")
@@ -240,7 +240,7 @@ def npz_names(path: Path) -> set[str]:
 
 
 def npz_arrays(path: Path, names: tuple[str, ...], most: int = _LARGEST) -> dict[str, np.ndarray]:
-    """The named arrays of an .npz file, each of at most ``most`` bytes with its header; no other one is touched."""
+    """The named arrays of an .npz file, each of at most ``most`` bytes with its header."""
     missing = [name for name in names if name not in npz_names(path)]
     if missing:
         raise CalibrationError(f"must hold the array {missing[0]!r}", file=path, choices=sorted(npz_names(path)))
@@ -261,7 +261,7 @@ def npz_arrays(path: Path, names: tuple[str, ...], most: int = _LARGEST) -> dict
 
 
 def npy_array(path: Path, key: str, data: bytes) -> np.ndarray:
-    """Array of the bytes of an .npy file, whose header must agree with their number; objects go through the restricted unpickler."""
+    """Array of an .npy file's bytes, as many as its header says; objects by ``load_restricted``."""
     stream = io.BytesIO(data)
     try:
         version = np.lib.format.read_magic(stream)

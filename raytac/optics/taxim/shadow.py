@@ -1,4 +1,4 @@
-"""Shadows of a Taxim table: rays from the rim of the contact darken the image, then the difference is blurred.
+"""Shadows of a Taxim table: rays from the contact's rim darken the image; then a blur.
 
 Si and Yuan, Taxim, RA-L 2022, section III-C, as their released simulator does it.
 """
@@ -26,11 +26,11 @@ class ShadowArrays:
     """Device arrays of a shadow table at one resolution."""
 
     values: Any
-    """Ordered integers (``ordered``) of the levels, 4 a (direction, depth, step), the last unused; +∞ where a list has ended."""
+    """``ordered`` levels, 4 a (direction, depth, step), the last unused; +∞ after a list's end."""
     ends: Any
-    """End of a pixel's way within the direction's pixels, by (direction, depth): those of the longest of the three lists."""
+    """End of a pixel's ray by (direction, depth): that of the longest of the three lists."""
     ways: Any
-    """Pixels that the rays of a direction pass, (column offset, row offset, step, unused), by (direction, place on the way)."""
+    """Pixels of a direction's rays by place: (column offset, row offset, step, unused)."""
 
 
 class ShadowCaster:
@@ -45,7 +45,7 @@ class ShadowCaster:
         scale: tuple[float, float],
         pitch: float,
     ) -> None:
-        """``scale``: calibration pixels per image pixel along x and y; ``pitch`` of an image pixel along x [m]."""
+        """``scale``: calibration pixels per image pixel (x, y); ``pitch`` [m] of one along x."""
         self.mi, self.table, self.resolution, self.scale, self.pitch = mi, table, resolution, scale, pitch
         # At another resolution every length keeps its size on the pad.
         self.ring = tuple(max(1, round(_DILATION * constants.ring_dilations / s)) for s in scale)
@@ -67,7 +67,7 @@ class ShadowCaster:
         return ShadowArrays(mi.Int32(ordered(values).ravel()), mi.UInt32(ends.astype(np.uint32).ravel()), mi.Int32(ways.ravel()))
 
     def _ways(self) -> tuple[np.ndarray, np.ndarray]:
-        """Ways (n_dir, n_places, 4) int32, and the number of places before step s, (n_dir, max_length + 1), that start at 1.
+        """Ways (n_dir, n_places, 4) int32, and places before step s (n_dir, max_length + 1), from 1.
 
         Rays of a fan pass the same pixels near their origin; each (step, pixel) is listed once, in the order of the steps.
         """
@@ -87,7 +87,7 @@ class ShadowCaster:
         return packed, np.stack(counts)
 
     def cast(self, seen: ImageHeights, of: Any, direction: Any, change: list[Any], arrays: ShadowArrays) -> list[Any]:
-        """``change`` (three channels of B·H·W levels) with shadows, blurred; ``of``: heights [px], ``direction`` of their slope [rad]."""
+        """``change`` (3 × B·H·W levels), shadowed, blurred; ``of`` [px], slope's ``direction`` [rad]."""
         mi, t = self.mi, self.table
         width, height = self.resolution
         _, n_dir, n_depth, length = t.values.shape
@@ -141,7 +141,7 @@ class ShadowCaster:
         return [out.x, out.y, out.z]
 
     def blur_background(self, image: np.ndarray) -> np.ndarray:
-        """The last blur of ``cast`` on an image (H, W, 3); being linear, it is done once for the background."""
+        """The last blur of ``cast`` on an image (H, W, 3): linear, so done once for the background."""
         out = np.asarray(image, dtype=np.float64)
         for axis, taps in ((1, self._final_taps[0]), (0, self._final_taps[1])):
             radius, n = len(taps) // 2, out.shape[axis]
@@ -199,7 +199,7 @@ def gaussian_taps(sigma: float, radius: int) -> np.ndarray:
 
 
 def ordered(values: np.ndarray) -> np.ndarray:
-    """float32 as int32 in the same order: the bits of what is positive, those of the rest with all but the sign turned over."""
+    """float32 as int32 in the same order: of negative ones all bits but the sign are flipped."""
     bits = np.ascontiguousarray(values, dtype=np.float32).view(np.int32)
     return np.where(bits >= 0, bits, bits ^ 0x7FFFFFFF)
 

@@ -1,4 +1,4 @@
-"""A Taxim table: polynomials by slope, shadows by direction and depth, the rest image, provenance.
+"""A Taxim table: polynomials by slope, shadows by direction and depth, the rest image.
 
 Si and Yuan, Taxim: an example-based simulation model for GelSight tactile sensors (RA-L 2022), section III. Conventions of every array
 here: colours in the order R, G, B (upstream's files are B, G, R), values in 8-bit levels (0-255, not clipped), row 0 at the image's
@@ -21,22 +21,22 @@ import numpy as np
 from raytac.errors import InputError
 
 SLOPES_OF = ("height", "displacement")
-"""Fields whose slopes index a table: the surface itself (upstream) or its displacement from rest (tables baked by raytac)."""
+"""Fields whose slopes index a table: the surface (upstream) or its displacement (baked)."""
 
 DEPTHS_OF = ("origin", "drop")
-"""Depths that index a shadow table: that of the pixel that casts (upstream), or its height above the shaded one."""
+"""Depths that index a shadow table: the casting pixel's (upstream), or the drop from it."""
 
 
 @dataclass(frozen=True)
 class TaximConstants:
-    """Settings of upstream's simulator, its values by default; lengths in pixels of the calibration image."""
+    """Settings of upstream's simulator and its values; lengths in calibration pixels."""
 
     background_sigma: float = 50.0
     """Width of the Gaussian over the rest image [px]."""
     background_share: float = 0.15
     """Share of the blurred rest image in the background, in [0, 1]."""
     background_threshold: float = 5.0
-    """Least mean of blurred − sharp over the channels [levels] at which the blurred image fills in (dark markers)."""
+    """Least mean of blurred − sharp [levels] at which the blurred image fills in (dark markers)."""
     ring_dilations: int = 2
     """Dilations of the contact by a 5 × 5 square whose new pixels cast shadows."""
     shadow_sigma: float = 2.0
@@ -58,15 +58,15 @@ class ShadowTable:
     directions: np.ndarray
     """Ray direction by direction bin [rad], shape (n_dir,)."""
     values: np.ndarray
-    """Difference from the background [levels], shape (3, n_dir, n_depth, max_length), float32; 0 beyond a list's length."""
+    """Change [levels], (3, n_dir, n_depth, max_length), float32; 0 beyond a list's length."""
     lengths: np.ndarray
-    """Number of values in each list, shape (3, n_dir, n_depth), int32; 0 is no shadow. values[…, 0] is never read (upstream)."""
+    """Values in each list, (3, n_dir, n_depth), int32; 0 is no shadow; the first is never read."""
     first_depth: float = 0.4e-3
     """Depth at which the bins start [m]."""
     depth_precision: float = 0.1e-3
     """Width of a depth bin [m]."""
     depth_offset: int = 6
-    """Added to the depth bin: 6 in upstream, without a reason given; 0 in tables that are indexed by the depth itself."""
+    """Added to the depth bin: 6 in upstream, without a reason; 0 in tables of raytac."""
     direction_precision: float = 0.1
     """Width of a direction bin [rad]."""
     step: float = 1.25
@@ -76,8 +76,10 @@ class ShadowTable:
     fan_precision: float = 0.05
     """Angle between the rays of a fan [rad]."""
     depth_of: str = "origin"
-    """``"origin"``: the depth bin is that of the ring pixel's indentation, one list for the whole ray (upstream). ``"drop"``: that of how
-    much less the shaded pixel is indented, so that a ray in the valley of a relief finds a low wall; not upstream's."""
+    """Depth that gives the bin, one of ``DEPTHS_OF``.
+
+    ``"origin"``: the ring pixel's indentation, one list for the whole ray (upstream). ``"drop"``: by how much less the shaded pixel is
+    indented, so that a ray in the valley of a relief meets a low wall."""
 
     def __post_init__(self) -> None:
         n_dir = len(self.directions)
@@ -102,7 +104,7 @@ class ShadowTable:
             raise InputError("shadow.fan_precision", value=self.fan_precision, rule="must make a fan of at most 64 rays")
 
     def rays(self) -> np.ndarray:
-        """Ray directions [rad], shape (n_dir, n_rays): arange(a − fan_angle, a + fan_angle, fan_precision) about each direction a.
+        """Ray directions [rad], (n_dir, n_rays): arange(a ± fan_angle, fan_precision) about each a.
 
         Rounding makes that one ray more for some directions than for others (upstream: 4 or 5); shorter fans repeat their last ray,
         which changes nothing.
@@ -114,34 +116,38 @@ class ShadowTable:
 
 @dataclass(frozen=True)
 class PolyTable:
-    """Differences from the rest image as polynomials of the position, one for each bin of the slope.
+    """Differences from the rest image: one polynomial of the position a slope bin.
 
     dI_c(x, y) = gradients[c, i, j] · [x², y², x y, x, y, 1] with i the magnitude's bin, j the direction's (``slope_bins``), x the
     column and y the row in the calibration image; the image is background + dI.
     """
 
     gradients: np.ndarray
-    """Coefficients [levels], shape (3, n_bins, n_bins, 6), float64: channel, magnitude bin, direction bin, monomial."""
+    """Coefficients [levels], (3, n_bins, n_bins, 6): channel, magnitude, direction, monomial."""
     covered: np.ndarray | None
-    """Bins of ``gradients`` that a calibration sample reached, shape (n_bins, n_bins), bool; the others hold a fill
-    (``provenance["fill"]`` says which). None if that is not known, as of upstream's folders."""
+    """Bins that a sample reached, (n_bins, n_bins), bool; None if not known (upstream).
+
+    The others hold a fill (``provenance["fill"]`` says which)."""
     background: np.ndarray
-    """Processed rest image to which the differences are added [levels], shape (H, W, 3), float32."""
+    """Processed rest image that differences are added to [levels], (H, W, 3), float32."""
     pixel_pitch: tuple[float, float]
     """Size of a pixel of the calibration image on the plane z = 0 along x and y [m]."""
     shadow: ShadowTable | None = None
     slopes_of: str = "displacement"
-    """``"displacement"``: slopes of rest − z, and dI = 0 where a pixel and its four neighbours have not moved, so that the image at
-    rest is the background exactly, also on a dome. ``"height"``: slopes of −z (upstream)."""
+    """Field whose slopes are the index, one of ``SLOPES_OF``.
+
+    ``"displacement"``: slopes of rest − z, and dI = 0 where a pixel and its four neighbours have not moved, so that the image at rest is
+    the background exactly, also on a dome. ``"height"``: slopes of −z (upstream)."""
     rest_image: np.ndarray | None = None
-    """The image at rest as it was taken, shape (H, W, 3), uint8, for ``save_calibration``; None: the rounded background."""
+    """Image at rest as taken, (H, W, 3), uint8, for ``save_calibration``; None: the background."""
     gel_map: np.ndarray | None = None
-    """Height of the gel at rest as upstream stores it [calibration pixels], shape (H, W), larger is farther from the camera."""
+    """Height at rest as upstream has it [calibration pixels], (H, W), larger is farther off."""
     surround: np.ndarray | None = None
-    """Coefficients where the object does not touch, as ``gradients``, which then hold for touched pixels alone: the apex of a press and the
-    skirt around it have slopes alike but not colours. None: one sheet serves both (upstream)."""
+    """Coefficients where the object does not touch; None: ``gradients`` serve both (upstream).
+
+    The apex of a press and the skirt around it have slopes alike but not colours."""
     one_sheet: np.ndarray | None = None
-    """Beside ``surround``: coefficients for all pixels alike, which a folder gives to readers that know one sheet; None: ``gradients``."""
+    """Beside ``surround``: coefficients for readers that know one sheet; None: ``gradients``."""
     constants: TaximConstants = TaximConstants()
     provenance: dict[str, str] = field(default_factory=dict)
     """Origin of the table, text by name: ``source``, ``sensor``, ``fill``, …"""
@@ -197,6 +203,6 @@ def slope_bins(slope_x: np.ndarray, slope_y: np.ndarray, n_bins: int) -> tuple[n
 
 
 def polynomial_basis(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """[x², y², x y, x, y, 1] in the order of ``PolyTable.gradients``, shape (…, 6), of columns x and rows y of the calibration image."""
+    """[x², y², x y, x, y, 1] of columns x and rows y, (…, 6), as in ``PolyTable.gradients``."""
     x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
     return np.stack([x * x, y * y, x * y, x, y, np.ones_like(x)], axis=-1)

@@ -42,7 +42,7 @@ class SceneBody:
     friction: float | None = None
     """μ against pads and bodies; None: each pad's own against pads."""
     skin: SoftSkin | None = None
-    """Smooth surface of a soft one, which a pad in contact is shown to touch; None: the faces of its tetrahedra."""
+    """Smooth surface of a soft one, shown in contact; None: the faces of its tetrahedra."""
 
     @property
     def name(self) -> str:
@@ -199,9 +199,8 @@ def object_body(
 def _checked_surface(name: str, parts: Sequence[Part], sag: float) -> ipc.TriMesh:
     """``object_surface`` of a body; a mesh that crosses itself is refused.
 
-    Tests of penetration fail on it.
-
-    Overlapping parts are common in models of robots, and only their outer walls touch anything, so they only cause a warning.
+    Tests of penetration fail on it. Overlapping parts are common in models of robots, and only their outer walls touch anything,
+    so they only cause a warning.
     """
     for part in parts:
         if part.kind == "mesh":

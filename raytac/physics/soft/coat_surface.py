@@ -19,8 +19,10 @@ _ITERATIONS = 8
 _TOLERANCE = 1e-8
 """Step below which that search has converged [m]."""
 _SAG = 3.0
-"""Allowance for a facet's sag on a convex object, over the object's depth below its own mean over a cell. For curvature κ that depth is
-κ cell²/6, and vertices lie up to 0.35 κ cell² below the facets around them (ball of 3.2 mm on cells of 1 mm)."""
+"""Allowance for a facet's sag on a convex object, over its depth below its mean over a cell.
+
+For curvature κ that depth is κ cell²/6, and vertices lie up to 0.35 κ cell² below the facets around them (ball of 3.2 mm, cells of
+1 mm)."""
 _SLACK = 1.0 / 64.0
 """Further allowance, as a share of the cell."""
 _CUT = 0.5e-3

@@ -14,9 +14,9 @@ from raytac.specs import PressScene
 from raytac.specs.press import PADS
 
 LEAST_CELLS = 6.0
-"""Least number of cells across a contact for an accurate force: three to its radius (docs/ipc.md, the pad of a sensor)."""
+"""Least number of cells across a contact for an accurate force: three to its radius."""
 _SMALL = 0.1
-"""Patches that together have less than this share of the contact's area do not count: specks at a rim."""
+"""Share of the contact's area below which patches together do not count: specks at a rim."""
 
 
 class NarrowContactWarning(UserWarning):

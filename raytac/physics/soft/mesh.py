@@ -50,8 +50,7 @@ class PadMesh:
 
     def __post_init__(self) -> None:
         if len(self.bonded) == 0:
-            rule = "must name at least one vertex: a pad without one would be pushed away"
-            raise InputError("bonded", value=[], rule=rule)
+            raise InputError("bonded", value=[], rule="must name at least one vertex: a pad without one would be pushed away")
         if len(self.bonded) == len(self.tets.vertices):
             raise InputError("bonded", value=f"all {len(self.bonded)} vertices", rule="must leave vertices that can move")
 

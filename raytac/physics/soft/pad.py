@@ -1,7 +1,4 @@
-"""The soft pad: the gel simulated with contact, friction and large deformation.
-
-Object or case are driven, or the object lies free.
-"""
+"""The soft pad: gel with contact, friction, large deformation, under driven or free bodies."""
 
 from __future__ import annotations
 
@@ -84,7 +81,7 @@ class SoftPad(PressPad):
             self._drive = PressController(scene, self.solver, self._reader, self._places, self.targets)
 
     def run(self, steps_per_stage: int = 1, *, progress: bool = False) -> Iterator[PadReading]:
-        """Readings as of ``PressPad``; ``progress``: shows the solver's steps with the stage beside it."""
+        """Readings as of ``PressPad``; ``progress`` shows the solver's steps and the stage."""
         with Progress(desc=f"press {self.scene.name}", unit="step", show=progress, leave=False) as bar:
             self._bar = bar
             if self._drive is not None:

@@ -43,10 +43,7 @@ class PressPlacement:
         self._check_stages(scene)
 
     def poses(self, height: np.ndarray, shear: np.ndarray, twist: np.ndarray) -> np.ndarray:
-        """``pad_from_object`` (B, 4, 4) at ``height`` [m] (B,) above first touch.
-
-        After ``shear`` (B, 2) and ``twist`` (B,).
-        """
+        """``pad_from_object`` (B, 4, 4): ``height`` [m] above touch, after ``shear`` and ``twist``."""
         poses = np.tile(np.eye(4), (len(height), 1, 1))
         for b, angle in enumerate(twist):
             poses[b, :3, :3] = about_z(angle) @ self._rotations[b]

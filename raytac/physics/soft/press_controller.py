@@ -84,9 +84,9 @@ class PressController:
         self._force = np.full(batch, np.nan)
         """Prescribed normal force [N]; NaN while a depth is prescribed."""
         self._clearance = np.full(batch, self._d_hat)
-        """Clearance by which the object is raised [m]: first the barrier's reach, then as it was measured."""
+        """Clearance by which the object is raised [m]: the barrier's reach, then as measured."""
         self.measured = np.full(batch, np.nan)
-        """Clearance in the state that was read last [m], (B,), which the reader sets; NaN out of contact."""
+        """Clearance in the last state read [m], (B,), set by the reader; NaN out of contact."""
         self._stiffness = np.full(batch, np.nan)
         self.failed: np.ndarray = self._targets.lost.copy()
         self._solver.unconverged[:] = 0

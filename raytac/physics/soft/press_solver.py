@@ -25,11 +25,7 @@ class PressSolver:
     def __init__(
         self, sensor: SensorSpec, mesh: PadMesh, body: SceneBody, start: np.ndarray, device: str, control: PressControl
     ) -> None:
-        """Put pad and object into a scene; ``start``: ``pad_from_object`` (B, 4, 4), clear of the pad.
-
-        Raises:
-            RaytacError: the object overlaps the pad at the start; the message names the surfaces.
-        """
+        """Put pad and object into a scene; ``start`` (B, 4, 4). ``RaytacError`` if they overlap."""
         self.body, self.control, self._friction = body, control, sensor.gelpad.friction
         settings = ipc.Settings(
             dt=control.time_step,

@@ -26,7 +26,7 @@ from raytac.specs.sensor import GelpadSpec
 _SAMPLE = 0.2e-3
 """Spacing of the samples at which the clearance is measured [m]."""
 _BEHIND = 1e-3
-"""An underside so far below the coat [m] belongs to an object beside or behind the pad: no contact overlaps by that much."""
+"""Overlap [m] beyond that of any contact: the object is beside or behind the pad."""
 
 
 class UnsolvedContactWarning(UserWarning):
@@ -44,9 +44,9 @@ class ContactObject:
     surface: tuple[np.ndarray, np.ndarray] | None = None
     """Present vertices (B, n, 3) [m] and faces of a soft object."""
     touching: np.ndarray | None = None
-    """Mask (B,) of the environments in which it touches; None: all. One that does not touch may lie behind the pad."""
+    """Mask (B,) of the environments in which it touches, else it may lie behind; None: all."""
     friction: float | None = None
-    """Coulomb's coefficient on the pad; None: not known, so the effect of friction is shown as the mesh has it."""
+    """Coulomb's coefficient on the pad; None: not known, friction is shown as the mesh has it."""
 
     def touches(self, b: int) -> bool:
         return self.touching is None or bool(self.touching[b])
@@ -101,7 +101,7 @@ class SoftReading:
     """B pads as they are shown; pad frame."""
 
     surface: GelSurface
-    """Its ``coat`` lies on the height that is shown: the solver's vertices with the correction, if there is one."""
+    """Its ``coat`` is the height shown: the solver's vertices with the correction, if any."""
     vertices: np.ndarray
     """The solver's own vertices of the coat [m], shape (B, V, 3): where ``forces`` act."""
     forces: np.ndarray
@@ -111,13 +111,15 @@ class SoftReading:
     poses: tuple[np.ndarray, ...]
     """``pad_from_object`` (B, 4, 4) of each object, lowered by the clearance."""
     underside: np.ndarray
-    """Underside of the objects over the grid [m], shape (B, Ny, Nx), inf where there is none. Of a rigid object, parts that lie wholly
-    above the pad's highest point may be missing."""
+    """Underside of the objects over the grid [m], (B, Ny, Nx), inf where there is none.
+
+    Rigid parts wholly above the pad's highest point may be missing."""
     residual: np.ndarray
-    """Deepest overlap or widest gap under pressure [m], (B,), of the corrected contact before the coat was laid on the object; NaN out
-    of contact, or without correction."""
+    """Deepest overlap or widest gap under pressure [m], (B,), of the corrected contact.
+
+    It is taken before the coat is laid on the object; NaN out of contact, or without correction."""
     failed: np.ndarray
-    """Environments of which nothing is shown, (B,) bool: those that had failed, and those with a number that is not finite."""
+    """Environments of which nothing is shown, (B,) bool: they failed, or are not finite."""
 
 
 class SoftReader:
@@ -126,7 +128,7 @@ class SoftReader:
     def __init__(
         self, mesh: PadMesh, gelpad: GelpadSpec, grid: PadGrid, correction: Correction | None = DEFAULT_CORRECTION
     ) -> None:
-        """Prepare to give surfaces on ``grid``; ``correction`` None: those of the spline through the solver's vertices."""
+        """Prepare surfaces on ``grid``; without ``correction`` the spline through the vertices."""
         self.mesh, self.grid, self.correction, self._gelpad = mesh, grid, correction, gelpad
         self._surface = CoatSurface(mesh.coat, gelpad)
         self._rows, self._columns = (m.astype(np.float32) for m in self._surface.matrices(grid.x, grid.y))
@@ -258,10 +260,7 @@ class SoftReader:
     def _underside(
         self, state: CoatState, b: int, grid: PadGrid, clearance: float = 0.0, smooth: np.ndarray | None = None
     ) -> np.ndarray:
-        """Underside of the shown objects over a grid [m], (Ny, Nx).
-
-        Without what lies far below the ``smooth`` coat, if given.
-        """
+        """Underside of the objects over a grid [m], (Ny, Nx), but for what is far below ``smooth``."""
         under = state.underside(b, grid.x, grid.y, float(grid.rest.max()), lowered=clearance)
         if len(state.objects) > 1 and smooth is not None:
             under[under < smooth - _BEHIND] = np.inf

@@ -209,10 +209,7 @@ class SoftScene:
         return rotation @ local @ np.swapaxes(rotation, 1, 2)
 
     def pose(self, name: str) -> np.ndarray:
-        """Present ``world_from_body`` or ``world_from_pad`` (B, 4, 4).
-
-        Of a free soft body, the rigid motion that fits it best.
-        """
+        """``world_from_body`` or ``world_from_pad`` (B, 4, 4); the best rigid fit of a soft body."""
         pose = np.tile(np.eye(4), (self.num_envs, 1, 1))
         body = None if name in self.pads else self._registry.body(name)
         if body is None or body.is_driven:
@@ -233,10 +230,7 @@ class SoftScene:
         return self.world.velocities(self._registry.body(name).name).mean(axis=1)
 
     def mesh(self, name: str, frame: str | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Present surface of a body or pad: vertices (B, n, 3) [m] and faces (F, 3).
-
-        In the world frame or that of the pad ``frame``.
-        """
+        """Surface: vertices (B, n, 3) [m], world frame or that of ``frame``, and faces (F, 3)."""
         vertices, faces = self.world.surface(name)
         positions = self.world.positions(name)
         if name in self.pads or self._registry.body(name).is_soft:
@@ -292,10 +286,7 @@ class SoftScene:
         return SceneState(self.world.save(), self._now.copy())
 
     def restore(self, state: SceneState, envs: ArrayLike | None = None) -> None:
-        """Return environments (a mask (B,), a list, None for all) to a saved state.
-
-        Contact forces are 0 until the next step.
-        """
+        """Return environments (mask, list, None: all) to a saved state; contact forces become 0."""
         mask = np.isin(np.arange(self.num_envs), chosen_envs(envs, self.num_envs))
         self.world.restore(state.world, mask)
         self._now.pads[mask] = state.poses.pads[mask]
@@ -308,9 +299,7 @@ class SoftScene:
     ) -> None:
         """Return environments to rest, without history, at the initial poses or others.
 
-        Shapes as for the scene itself.
-
-        Raises ``OverlapError`` if bodies overlap at these poses; nothing has changed then.
+        Shapes as for the scene itself. Raises ``OverlapError`` if bodies overlap at these poses; nothing has changed then.
         """
         mask = np.isin(np.arange(self.num_envs), chosen_envs(envs, self.num_envs))
         if world_from_pad is None and world_from_body is None:

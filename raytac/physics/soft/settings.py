@@ -37,9 +37,9 @@ class Correction(_Settings):
     tangential: bool = True
     """Correct how far pressure spreads the skin sideways (``TangentialCorrection``)."""
     friction: bool = True
-    """Correct how far the skin follows an object that is sheared or twisted (``FrictionCorrection``)."""
+    """Correct how far the skin follows a sheared or twisted object (``FrictionCorrection``)."""
     pitch: float = 0.1e-3
-    """Spacing of the fine grid [m], far below a cell. A surface's own grid is used if its spacing is above 0.9 times this."""
+    """Spacing of the fine grid [m]; the surface's own grid if that is above 0.9 times this."""
     gap_tolerance: float = 1e-6
     """Deepest overlap and widest gap under pressure of a solved contact [m]."""
     normal_iterations: int = 40
@@ -47,15 +47,15 @@ class Correction(_Settings):
     unsolved: float = 5e-6
     """Residual above which an ``UnsolvedContactWarning`` is given [m]."""
     closed_gap: float = 20e-6
-    """Scale below which gaps under pressure are closed between nodes [m]: beside a sharp rim waves leave some micrometres."""
+    """Scale [m] below which gaps under pressure are closed: waves leave some beside a sharp rim."""
     open_gap: float = 5e-3
     """Gap that stands for "no object" [m]: wider than any press closes."""
     clear_gap: float = 0.4e-3
-    """Gap at zero pressure beyond which a node stays clear [m]: more than gel rises beside a contact."""
+    """Gap without pressure that keeps a node clear [m]: more than gel rises beside a contact."""
     least_load: float = 1e-4
     """Share of the greatest load, or pressure, below which a vertex, or node, does not touch."""
     tangential_pitch: float = 0.2e-3
-    """Spacing of the grid of sideways motion and traction [m]: waves shorter than twice that hardly move the skin sideways."""
+    """Spacing of the grid of sideways motion [m]: shorter waves hardly move the skin."""
     motion_tolerance: float = 0.5e-6
     """Difference below which two sideways motions are equal [m]."""
     stick_tolerance: float = 2e-6
@@ -63,11 +63,11 @@ class Correction(_Settings):
     sliding_share: float = 0.05
     """Share of sticking nodes below which the whole contact slides."""
     full_blend: float = 0.3
-    """Share of the motion in contact that the layer may fail to explain while friction is corrected fully."""
+    """Share of motion that the layer does not explain, up to which friction is corrected fully."""
     no_blend: float = 0.5
     """The same above which friction is not corrected at all; linear between."""
     small_motion: float = 20e-6
-    """Motion below which that share says little [m], so that a press just off the centre is shown as one at the centre (a guess)."""
+    """Motion [m] below which that share says little: a press just off the centre (a guess)."""
     slip_iterations: int = 6
     """Most updates of the object's motion and of the slip limit."""
     traction_iterations: int = 10
@@ -99,7 +99,7 @@ class SubstepLimits(_Settings):
     reach: float = 4.0
     """Distance below which bodies are near, in units of d̂."""
     clear: float = 1e-3
-    """Bodies that one face normal keeps so far apart [m] at both ends of a motion cannot meet during it."""
+    """Distance along a face normal [m] at both ends of a motion that rules out a contact."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -112,11 +112,11 @@ class SceneSettings(_Settings):
     """Accuracy of a soft scene, whose steps have a physical duration."""
 
     creep: float = 5e-5
-    """ε_v [m/s]: at a share r of the friction limit a sticking contact creeps at ε_v (1 − √(1 − r)); r = 0.75: 0.05 mm in two seconds."""
+    """ε_v [m/s]: at a share r of the friction limit a contact creeps at ε_v (1 − √(1 − r))."""
     tolerance: float = 2e-8
-    """A step is solved when no vertex would move further [m]; forces of sticking contacts need it small against ε_v dt."""
+    """A step is solved when no vertex would move further [m]; small against ε_v dt."""
     linear_tolerance: float = 1e-6
-    """Relative residual of the linear solve: a grasped body must follow to a small share of ε_v dt, or friction would slip."""
+    """Relative residual of the linear solve: a grasped body must follow far below ε_v dt."""
     substeps: SubstepLimits = SubstepLimits()
     """Division of steps near contact."""
 
@@ -134,12 +134,13 @@ class PressControl(_Settings):
     blocked: float = 1e-3
     """Share of a step's motion that may be refused before a contact counts as jammed."""
     stiffer: float = 4.0
-    """Factor on the barrier's stiffness where a contact jams, such as a cone's tip on one facet. The pressure that a barrier bears is
-    bounded while surfaces keep apart, and few small facets bear the force."""
+    """Factor on the barrier's stiffness where a contact jams, such as a cone's tip on one facet.
+
+    A barrier's pressure is bounded while surfaces keep apart, and few small facets carry the force."""
     stiffenings: int = 4
     """Most such increases in one step."""
     friction_tolerance: float = 0.01
-    """Friction is settled when the forces on the coat change by a smaller share in a step, and stay within their cone by it."""
+    """Share by which settled forces change in a step at most, and may leave the friction cone."""
     friction_steps: int = 60
     """Most steps at rest that settle friction."""
     friction_force: float = 1e-5
@@ -149,11 +150,11 @@ class PressControl(_Settings):
     force_tolerance: float = 5e-4
     """A normal force is reached within this share."""
     force_steps: int = 120
-    """Most steps of the search for a force; an object that lies free takes up to four times as many to come to rest."""
+    """Most steps of the search for a force; a free object takes up to four times as many."""
     refinements: int = 4
-    """Most repetitions of a correction: of the depth, of friction, of a step that did not converge."""
+    """Most repetitions of a correction: of depth, friction, a step that did not converge."""
     stiffness_change: float = 0.01
-    """Share of the force by which it must change to give the contact's stiffness; a smaller change may be friction that yields."""
+    """Least relative change of force that gives the contact's stiffness; less may be friction."""
     growth: float = 8.0
     """Factor on the present normal force up to which the contact's stiffness is extrapolated."""
     least_force: float = 1e-6

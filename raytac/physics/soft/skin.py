@@ -15,11 +15,11 @@ _FINEST = 1e-6
 _EDGE = 0.3
 """Longest edge of the skin over the mean edge of the tetrahedra."""
 _NEIGHBOURS = 30
-"""Least number of vertices that each point of the skin depends on; so many also average out the pad's facets."""
+"""Least number of vertices that a point of the skin depends on; they average out facets."""
 _WIDER = 1.15
 """Radius of the weights over the distance of the farthest of them."""
 _REGULAR = 1e-3
-"""Weight against bending, over that of the vertices: vertices on a sphere do not determine all second derivatives."""
+"""Weight against bending: vertices on a sphere do not determine all second derivatives."""
 _CHUNK = 1000
 """Points processed at once."""
 
@@ -53,10 +53,7 @@ class SoftSkin:
 
 
 def _weights(points: np.ndarray, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (P, K) that each of ``points`` (P, 3) depends on, and their weights (P, K).
-
-    Weights sum to 1 and are 0 beyond their radius.
-    """
+    """Vertices and weights (P, K) of ``points`` (P, 3); weights sum to 1, 0 beyond their radius."""
     most = min(_NEIGHBOURS, len(vertices)) - 1
     chunks = [points[k : k + _CHUNK] for k in range(0, len(points), _CHUNK)]
     reach = _WIDER * max(float(np.sqrt(np.partition(_squares(chunk, vertices), most, axis=1)[:, most].max())) for chunk in chunks)
@@ -100,10 +97,7 @@ def _subdivide(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple
 
 
 def _split(faces: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Triangles (T, 3) divided at the vertices in the ``middle`` (T, 3) of their edges.
-
-    Edges 01, 12, 20; −1 where an edge stays whole.
-    """
+    """Triangles (T, 3) divided at the ``middle`` (T, 3) of edges 01, 12, 20; −1: not divided."""
     count = int((middle[0] >= 0).sum())
     if count == 0:
         return faces

@@ -49,10 +49,9 @@ class Substeps:
     def next_part(self, done: int, now: Poses, goal: Poses, dt: float) -> tuple[int, dict[int, Pair | None]]:
         """Part of a step of ``dt`` [s] that may be made next, and the environments to refuse.
 
-        With the pair that moves too far.
-
-        Parts are counted in ``limits.most``-ths of the step; the result is a power of two that divides ``done``. Refused environments do
-        not limit it. Free bodies are never refused (a beam may snap back): the solver resolves them, in the smallest parts.
+        With the pair that moves too far. Parts are counted in ``limits.most``-ths of the step; the result is a power of two that
+        divides ``done``. Refused environments do not limit it. Free bodies are never refused (a beam may snap back): the solver
+        resolves them, in the smallest parts.
         """
         most = self.limits.most
         room, pairs = self._room(done, self._motions(now, goal, dt * (1.0 - done / most)))

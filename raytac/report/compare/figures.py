@@ -150,10 +150,7 @@ def signed_error(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
 
 def error_range(errors: Sequence[np.ndarray]) -> float:
-    """A round number of levels that the signed errors seldom exceed, at least 2.
-
-    It is the 99th percentile of the middle image.
-    """
+    """Range of signed errors, at least 2 levels: 99th percentile of the middle image, rounded."""
     if not errors:
         return 2.0
     typical = statistics.median(float(np.percentile(np.abs(error), 99)) for error in errors)

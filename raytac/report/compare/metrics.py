@@ -221,10 +221,7 @@ def _row_metrics(row: Row) -> dict[str, Metric]:
 
 
 def _against_peer(rows: Sequence[Row], shadow: str) -> dict[str, Metric]:
-    """Time of the package over ours at the largest common resolution, batch 1.
-
-    Medians over scenes.
-    """
+    """Time of the package over ours at the largest common resolution, batch 1, median of scenes."""
     metrics: dict[str, Metric] = {}
     for resolution in resolutions(rows):
         here = select(rows, resolution=resolution)

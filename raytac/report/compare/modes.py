@@ -76,10 +76,7 @@ class _Sampled:
 
 
 def comparison_modes(spp: Sequence[int] = (1, 4, 16, 64), *, quick: bool = False) -> tuple[Mode, ...]:
-    """Every mode of the comparison; the sampled ones once for each of ``spp``.
-
-    ``quick`` builds no costly variants.
-    """
+    """Every mode, sampled ones once for each of ``spp``; ``quick`` builds no costly variants."""
     modes = []
     for name in OPTICS.names:
         for variant in OPTICS.config_class(name).variants():

@@ -268,10 +268,7 @@ class _Run:
         return figures | {"batch_ms_per_frame": float(np.median(calls)) / self.batch, "batch_calls": len(calls)}
 
     def _memory(self, built: OpticalMode, surface: GelSurface, batched: bool) -> dict[str, Value]:
-        """Peak of the device arrays of one call, and its growth per environment [MiB].
-
-        None if not Dr.Jit.
-        """
+        """Peak of device arrays of a call, its growth per environment [MiB]; None if not Dr.Jit's."""
         from raytac.optics.runtime import peak_bytes
 
         one, many = (moving([surface], n, 1)[0] for n in (1, self.batch))
@@ -300,10 +297,7 @@ class _Scene:
 
     @cached_property
     def noise(self) -> dict[str, dict[str, float]]:
-        """Noise of the reference by region.
-
-        Half the difference of independent halves varies as their mean.
-        """
+        """Noise of the reference by region: half the difference of its independent halves."""
         one, two = self._halves
         figures = {}
         for region, mask in self.masks.items():

@@ -26,10 +26,7 @@ Value = str | int | float | bool | None
 
 @dataclass(frozen=True)
 class Row:
-    """Figures of one scene, resolution and mode by column name; and the image.
-
-    A figure is None where it is not defined or not known.
-    """
+    """Figures of a scene, resolution and mode by column, None if not known; and the image."""
 
     figures: dict[str, Value]
     image: np.ndarray
@@ -90,10 +87,7 @@ def _digest_image(image: np.ndarray) -> str:
 
 
 class References:
-    """Images of the ``reference`` integrator without limit of depth, kept in ``folder``.
-
-    Their names are hashes of all that shapes them.
-    """
+    """Images of ``reference`` without limit of depth, named by a hash of all that shapes them."""
 
     def __init__(
         self, folder: Path, tracers: Tracers, size: tuple[int, int], spp: int, say: Callable[[str], object] = print

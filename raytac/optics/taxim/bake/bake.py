@@ -9,27 +9,22 @@ from the ray tracer*).
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from itertools import chain
+from dataclasses import dataclass
 
 import numpy as np
 
 from raytac.io.progress import Progress
 from raytac.optics.taxim.bake.fit import BinFit, BinSums, two_sheets
-from raytac.optics.taxim.bake.presses import ball_presses, pin_presses
-from raytac.optics.taxim.bake.settings import BakeSettings
-from raytac.optics.taxim.bake.shadow import ShadowSums
+from raytac.optics.taxim.bake.presses import ball_presses
+from raytac.optics.taxim.bake.settings import PLAIN, BakeSettings
+from raytac.optics.taxim.bake.shadow import bake_shadow
 from raytac.optics.taxim.bake.views import Calibration, Views
 from raytac.optics.taxim.cache import cached, keep, table_folder
-from raytac.optics.taxim.table import PolyTable, ShadowTable, TaximConstants, slope_bins
+from raytac.optics.taxim.table import PolyTable, slope_bins
 from raytac.specs.sensor import SensorSpec
 
 MOVED = 5e-6
-"""Least displacement [m] of a pixel that counts as a sample: a hundredth of a usual press, which changes an image by less than rounding."""
-
-PLAIN = TaximConstants(background_sigma=1.0, background_share=0.0, background_threshold=1e3, shadow_sigma=0.0, final_sigma=0.0)
-"""The background is the image at rest as it is, and nothing is blurred: what comes out is what the ray tracer showed."""
+"""Least displacement [m] of a sample: a hundredth of a usual press, too little to show."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +48,11 @@ def baked_table(
     settings: BakeSettings | None = None,
     progress: bool = True,
 ) -> PolyTable:
-    """The table of ``bake``, with its arguments and errors, baked once and kept under a digest of sensor, lights, settings and code.
+    """The table of ``bake``, with its arguments and errors, baked once and kept in a cache.
 
-    It is kept in the user's cache, as a calibration folder; an entry that is damaged is baked again, with a warning. An interrupt leaves
-    nothing there. Where the cache cannot be written the table is used and not kept, with a warning. A cached table may come from the
-    other device, whose images differ by rounding.
+    It is a calibration folder under a digest of sensor, lights, settings and code; a damaged one is baked again, with a warning. An
+    interrupt leaves nothing there. Where the cache cannot be written the table is used and not kept, with a warning. A cached table may
+    come from the other device, whose images differ by rounding.
     """
     settings = BakeSettings() if settings is None else settings
     folder = table_folder(sensor, settings, seed, resolution or sensor.camera.resolution)
@@ -126,26 +121,6 @@ def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: in
         },
     )
     return Baked(table, fit, images, at)
-
-
-def bake_shadow(
-    at: Calibration,
-    *,
-    settings: BakeSettings | None = None,
-    seed: int = 0,
-    tick: Callable[[int], object] = lambda count: None,
-) -> ShadowTable:
-    """The shadow table alone, in the levels of ``at``'s images; ``tick`` is called with the number of rendered images, six a pin in all."""
-    settings = BakeSettings() if settings is None else settings
-    pad, grid, camera = at.sensor.gelpad, at.grid, at.tracer.camera
-    shades = ShadowSums(2 * PLAIN.ring_dilations, settings.depth_range(pad.thickness)[1], camera.resolution)
-    # Pins, whose walls are as steep as the surround allows, and as many single balls, whose flanks cast little.
-    single = replace(settings, images=settings.pins, balls=1, bare_share=0.0)
-    presses = chain(pin_presses(pad, grid, camera, settings, seed), ball_presses(pad, grid, camera, single, seed + 1))
-    for views, cast in at.shadow_views(presses):
-        shades.add(views, cast, at.rest_image)
-        tick(3 * len(views.rgb))
-    return shades.table()
 
 
 def add_samples(sums: BinSums, views: Views, rest_image: np.ndarray, own: np.ndarray) -> None:

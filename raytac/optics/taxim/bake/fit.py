@@ -1,4 +1,4 @@
-"""From samples to polynomials: normal equations of every slope bin, summed over all presses and solved at once.
+"""Polynomials from samples: normal equations of every slope bin, summed over all presses.
 
 A bin's model is dI(x, y) = g · [x², y², x y, x, y, 1] (Si and Yuan, RA-L 2022, section III). All bins' 6 × 6 normal equations
 Σ a aᵀ g = Σ a dI are kept in float64, so a million samples cost no memory and their order hardly matters.
@@ -17,7 +17,7 @@ from raytac.optics.taxim.table import polynomial_basis
 _TERMS = [5], [3, 4, 5], [0, 1, 2, 3, 4, 5]
 """Monomials of a polynomial of degree 0, 1 and 2."""
 _MIN_COUNT = {1: 15.0, 2: 60.0}
-"""Samples that a polynomial of degree 1 and 2 needs at least: five a coefficient and ten a coefficient."""
+"""Least samples of a polynomial of degree 1 and 2: five and ten a coefficient."""
 _MIN_SPREAD = 0.02
 """Least spread, relative to the whole image, that a degree needs; see ``_spread``."""
 _PULL = 0.3
@@ -50,7 +50,7 @@ class BinSums:
         self._moment = np.zeros((n_bins * (n_bins - 1), 6, 3))
 
     def add(self, i: np.ndarray, j: np.ndarray, column: np.ndarray, row: np.ndarray, difference: np.ndarray) -> None:
-        """Samples of bins (``i``, ``j``) at pixels (``column``, ``row``), each (N,), with ``difference`` [levels], (N, 3)."""
+        """Add samples (N,): bins (``i``, ``j``), pixels, ``difference`` [levels] (N, 3)."""
         if not len(i):
             return
         key = i * (self.n_bins - 1) + np.minimum(j, self.n_bins - 2)
@@ -130,7 +130,7 @@ class BinSums:
 
 
 def two_sheets(touched: BinSums, around: BinSums, *, neighbours: float, ridge: float) -> tuple[BinFit, dict[str, Any]]:
-    """Fit of the touched pixels, and the fields of a ``PolyTable`` of two sheets; for readers that know one it has that of all samples."""
+    """Fit of the touched pixels, and fields of a ``PolyTable``: two sheets, and one for all."""
     contact, surround, together = (
         sums.solve(neighbours=neighbours, ridge=ridge) for sums in (touched, around, touched.plus(around))
     )
@@ -139,7 +139,7 @@ def two_sheets(touched: BinSums, around: BinSums, *, neighbours: float, ridge: f
 
 
 def _spread(gram: np.ndarray, terms: list[int], uniform: np.ndarray) -> np.ndarray:
-    """Smallest eigenvalue (N,) of the covariance of the samples' monomials, relative to samples all over the image.
+    """Smallest eigenvalue (N,) of the monomials' covariance, over that of the whole image.
 
     1: as wide as the whole image in every direction of the model; 0: some combination of the terms is as good as constant.
     """
@@ -154,7 +154,7 @@ def _spread(gram: np.ndarray, terms: list[int], uniform: np.ndarray) -> np.ndarr
 
 
 def _with_neighbours(sums: np.ndarray, weight: float) -> np.ndarray:
-    """Sums (n, m, …) plus ``weight`` times those of the eight bins around each; directions close on themselves, magnitudes end."""
+    """Sums (n, m, …) plus ``weight`` times those of the eight bins around; directions close."""
     if weight == 0.0:
         return sums
     rows = sums.copy()
@@ -165,7 +165,7 @@ def _with_neighbours(sums: np.ndarray, weight: float) -> np.ndarray:
 
 
 def _fill_from(covered: np.ndarray) -> np.ndarray:
-    """Flat index of the bin that each bin (n, m) takes its polynomial from; its own where it is covered."""
+    """Flat index of the bin that gives each bin (n, m) its polynomial; its own if covered."""
     n, m = covered.shape
     i, j = np.arange(n)[:, None], np.arange(m)[None, :]
     # Distance in magnitude first, gentler before steeper, and a direction counts as farther than any magnitude of the same direction.

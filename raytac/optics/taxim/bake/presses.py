@@ -1,4 +1,4 @@
-"""The presses of the virtual calibration: balls all over the pad, with the gel around them or bare.
+"""Presses of the virtual calibration: balls all over the pad, with surround or bare.
 
 A real calibration (Taxim's, some fifty presses of one ball) has steep slopes where the ball is and none elsewhere. Here the balls
 differ in size and depth and follow a sequence that fills the space of place × size × depth evenly, so that every slope and direction
@@ -21,14 +21,14 @@ from raytac.shapes.underside import object_height
 from raytac.specs.sensor import GelpadSpec
 
 _GAP = 1.5e-3
-"""Least distance between the rims of two balls in one image [m]: the widest Gaussian of the surround is 0.9 mm."""
+"""Least distance between the rims of two balls [m]; the widest Gaussian is 0.9 mm."""
 _PIN_HALF_LENGTH = 2e-3
 _TRIES = 24
 """Points of the sequence that an image may use up to place its balls."""
 
 
 def even_sequence(dimensions: int, start: np.ndarray) -> Iterator[np.ndarray]:
-    """Points in the unit cube, each (dimensions,), that fill it evenly at any length: xₙ = frac(start + n α).
+    """Points (dimensions,) that fill the unit cube evenly at any length: xₙ = frac(start + n α).
 
     α_k = g^−k with g the positive root of g^(d+1) = g + 1 (M. Roberts, The unreasonable effectiveness of quasirandom sequences, 2018;
     for d = 1 the golden ratio).
@@ -44,12 +44,12 @@ def even_sequence(dimensions: int, start: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def view_half(camera: Pinhole) -> np.ndarray:
-    """Half the extent (x, y) [m] of what the camera sees of the plane z = 0, the smaller side if the axis is off centre."""
+    """Half the extent (x, y) [m] of the plane z = 0 in view, the smaller side if off centre."""
     return np.array([min(-nodes[0], nodes[-1]) for nodes in camera.pixel_centres_on_plane()])
 
 
 def pressed(grid: PadGrid, parts: list[Part], surround: ElasticSurround | None) -> GelSurface:
-    """Surface of one environment under parts placed in the pad frame; without ``surround`` the bare overlap."""
+    """Surface of one environment under placed parts; without ``surround`` the bare overlap."""
     under = object_height(parts, np.eye(4)[None], grid.x, grid.y, below=float(grid.rest.max()))
     if surround is not None:
         return surround.surface(under)
@@ -58,7 +58,7 @@ def pressed(grid: PadGrid, parts: list[Part], surround: ElasticSurround | None) 
 
 
 def ball_presses(gelpad: GelpadSpec, grid: PadGrid, camera: Pinhole, settings: BakeSettings, seed: int) -> Iterator[GelSurface]:
-    """``settings.images`` surfaces, one environment each, with up to ``settings.balls`` balls apart from each other.
+    """``settings.images`` surfaces of one environment, each with up to ``settings.balls`` balls.
 
     Radii are spread evenly in their logarithm, depths below the resting surface under the ball's centre evenly; a ball is never pressed
     beyond its equator, and its contact lies wholly in view.
@@ -87,7 +87,7 @@ def ball_presses(gelpad: GelpadSpec, grid: PadGrid, camera: Pinhole, settings: B
 
 
 def _placed(kind: str, size: tuple[float, ...], gelpad: GelpadSpec, centre: np.ndarray, depth: float) -> Part:
-    """A primitive, half as high as the last of ``size``, whose end is ``depth`` [m] below the resting surface at ``centre``."""
+    """A primitive of half height ``size[-1]``, its end ``depth`` [m] below rest at ``centre``."""
     place = np.eye(4)
     place[:2, 3] = centre
     place[2, 3] = float(rest_height(gelpad, centre[0], centre[1])) + size[-1] - depth
@@ -95,7 +95,7 @@ def _placed(kind: str, size: tuple[float, ...], gelpad: GelpadSpec, centre: np.n
 
 
 def pin_presses(gelpad: GelpadSpec, grid: PadGrid, camera: Pinhole, settings: BakeSettings, seed: int) -> Iterator[GelSurface]:
-    """``settings.pins`` surfaces, each with one flat-ended pin, whose depths rise in equal steps; with the gel around it.
+    """``settings.pins`` surfaces, each with one flat-ended pin; depths rise in equal steps.
 
     Radii (evenly in their logarithm) and places follow the even sequence; the pin lies wholly in view.
     """

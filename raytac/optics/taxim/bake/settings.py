@@ -1,4 +1,4 @@
-"""Settings of a bake: numbers of presses and their ranges. They are part of a cached table's key."""
+"""Settings of a bake: numbers of presses and their ranges, which a cached table's key holds."""
 
 from __future__ import annotations
 
@@ -6,6 +6,10 @@ from dataclasses import dataclass
 
 from raytac.checks import check_number, check_numbers, check_whole
 from raytac.errors import InputError
+from raytac.optics.taxim.table import TaximConstants
+
+PLAIN = TaximConstants(background_sigma=1.0, background_share=0.0, background_threshold=1e3, shadow_sigma=0.0, final_sigma=0.0)
+"""The image at rest is the background as it is, and nothing is blurred."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +33,9 @@ class BakeSettings:
     neighbours: float = 0.3
     """Weight of the samples of each of the eight bins around a bin in its fit."""
     ridge: float = 1e-4
-    """Pull of the polynomial's terms, the constant left out, to 0, relative to the number of samples, over positions in [−1, 1]."""
+    """Pull of all but the constant term to 0, over the number of samples; positions in [−1, 1]."""
     pins: int = 96
-    """Presses of a pin, and as many of a single ball, from which the shadows are read; 0 bakes none."""
+    """Presses of a pin, and as many of a ball, that shadows are read from; 0 bakes none."""
     pin_radius: tuple[float, float] = (0.4e-3, 2e-3)
     """Thinnest and thickest pin [m]."""
 

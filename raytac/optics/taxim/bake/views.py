@@ -1,4 +1,4 @@
-"""The camera's view of calibration presses: what the ray tracer shows of them and where they slope."""
+"""The camera's view of calibration presses: their ray-traced images and slopes."""
 
 from __future__ import annotations
 
@@ -64,12 +64,12 @@ class Calibration:
         self._rest = self.tracer.mi.Float(rest.height.ravel())
 
     def views(self, presses: Iterable[GelSurface]) -> Iterator[Views]:
-        """Render ``presses`` (one environment each, on ``grid``) in batches and see their slopes as the table mode does."""
+        """Render ``presses`` on ``grid`` in batches, with slopes as the table mode sees them."""
         for surface in self._batches(presses):
             yield self._view(surface)
 
     def shadow_views(self, presses: Iterable[GelSurface]) -> Iterator[tuple[Views, np.ndarray]]:
-        """As ``views``, with what cast shadows add to direct light [levels], (B, H, W, 3) int16, negative in a shadow."""
+        """As ``views``, with the change by shadows [levels], (B, H, W, 3) int16, negative in them."""
         for surface in self._batches(presses):
             with_shadows, without = (tracer.render(surface).rgb for tracer in self._direct)
             assert with_shadows is not None and without is not None

@@ -22,7 +22,7 @@ class CosineSeries:
         self.sine_analysis = 2.0 * np.sin(np.pi * np.outer(order, order) / (n - 1)) / (n - 1)
         """The same for sines, which are 0 at the ends, shape (n, n)."""
         self.hat = np.sinc(0.5 * order / (n - 1)) ** 2
-        """Amplitudes of hat functions on the nodes over those of the cosines through the same values, shape (n,)."""
+        """Amplitudes of hat functions over those of the cosines through the same values, (n,)."""
 
     def synthesis(self, t: np.ndarray) -> np.ndarray:
         """Matrix from amplitudes to values at ``t`` [m], shape (P, n)."""

@@ -21,15 +21,15 @@ class NormalContact:
     """Normal contact of one pad, solved on the fine grid."""
 
     rise: np.ndarray
-    """w − E w: height over rest [m] that is not due to normal contact, over the lattice of ``CoatSurface.rise``."""
+    """w − E w: height over rest [m] not due to normal contact, as of ``CoatSurface.rise``."""
     pressure: np.ndarray
     """p: normal pressure on the fine grid [Pa], (Ny, Nx), >= 0."""
     waves: np.ndarray
     """A p: cosine amplitudes of the dent in the layer [m], (Ny, Nx)."""
     border: np.ndarray
-    """Dent [m] at the coat's vertices that the pad's free sides add to the layer's, (rows, columns)."""
+    """Dent [m] that the pad's free sides add to the layer's, at vertices (rows, columns)."""
     mesh_forces: np.ndarray
-    """Normal forces on the coat's vertices [N], (V,), along z, that hold the linear mesh in contact."""
+    """Normal forces on the coat's vertices [N], (V,), that hold the linear mesh in contact."""
     residual: float
     """Deepest overlap or widest gap under pressure that the solution has [m]."""
 
@@ -159,10 +159,7 @@ class NormalCorrection:
         return load > self.settings.least_load * load.max()
 
     def _mesh_forces(self, upwards: np.ndarray, touching: np.ndarray) -> np.ndarray:
-        """Forces along z [N], (V,), on ``touching`` vertices that lift the linear mesh ``upwards``.
-
-        0 where it is bonded.
-        """
+        """Forces [N], (V,), on ``touching`` vertices that lift the mesh ``upwards``; 0 if bonded."""
         free = touching & (np.diagonal(self._compliance) > 0.0)
         forces = np.zeros(len(upwards))
         forces[free] = np.linalg.solve(self._compliance[np.ix_(free, free)], upwards[free])
