@@ -160,10 +160,7 @@ class FrictionCorrection:
         return blend * (layer - mesh).T.astype(float)
 
     def solve(self, pressure: np.ndarray, goal: PlaneMotion, friction: float) -> TangentialContact | None:
-        """Stick and slip under ``pressure`` (Ny, Nx) [Pa] whose mean displacement is ``goal``.
-
-        None where no node is in contact, or none of those can move.
-        """
+        """Stick and slip under ``pressure`` [Pa] for a mean displacement ``goal``, or None."""
         settings = self._settings
         place = np.stack(np.meshgrid(self._x, self._y), axis=-1)
 
