@@ -52,7 +52,7 @@ class JointSprings:
         return self._reader.reads(datas)
 
     def aim(self, joints: np.ndarray, speed: np.ndarray, start: np.ndarray, others: np.ndarray | float = 0.0) -> None:
-        """Aim at ``joints`` (B, n) from ``start`` (B,) [s] at ``speed``; ``others`` (B, k): controls."""
+        """Aim at ``joints`` (B, n) from ``start`` [s] at ``speed``; ``others`` (B, k): controls."""
         self._target[:], self._speed[:], self._start[:], self._others[:] = joints, speed, start, others
 
     def torque(self) -> np.ndarray:
