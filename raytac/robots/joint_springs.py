@@ -24,10 +24,7 @@ class JointSprings:
     def __init__(
         self, arm: Arm, datas: Sequence[mujoco.MjData], *, frequency: float, damping_ratio: float, others: Sequence[int] = ()
     ) -> None:
-        """Springs of ``frequency`` [rad/s] and ``damping_ratio`` that hold no target yet.
-
-        ``others``: actuators that are commanded beside the arm's motors.
-        """
+        """Springs of ``frequency`` [rad/s], without target; ``others``: actuators beside the motors."""
         self.arm, self._datas = arm, tuple(datas)
         count, n = len(self._datas), len(arm)
         self._reader = StateReader(self._datas, {name: one for name, one in arm.numbers().items() if name in _READ})

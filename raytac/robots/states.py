@@ -73,10 +73,7 @@ class StateReader:
     """
 
     def __init__(self, datas: Sequence[mujoco.MjData], members: Mapping[str, Numbers]) -> None:
-        """Look up where ``members`` of ``datas`` lie; nothing is read yet.
-
-        Raises ``InputError`` for what is no array of float64 of fixed size, or for an index beyond it.
-        """
+        """Look up where ``members`` of ``datas`` lie; InputError for no float64 of fixed size."""
         start_warp()
         self._datas = tuple(datas)
         for one in members.values():
