@@ -19,7 +19,7 @@ from raytac.io.metrics import Metric
 
 
 def moving(surfaces: Sequence[GelSurface], batch: int, count: int) -> list[GelSurface]:
-    """``count`` batches of ``surfaces`` (B = 1), no two alike, at 70 to 100 % of the indentation."""
+    """``count`` batches of ``surfaces`` (B = 1), no two alike, at 70 to 100 % of indentation."""
     batches = []
     for k in range(count):
         picks = [surfaces[(k * batch + b) % len(surfaces)] for b in range(batch)]
