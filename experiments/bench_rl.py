@@ -3,10 +3,12 @@
     python experiments/bench_rl.py --out runs/bench_rl
     python experiments/bench_rl.py --envs 16 --modes fots,table32 --steps 40
     git worktree add ../raytac_b682ef2 b682ef2; python experiments/bench_rl.py --against ../raytac_b682ef2 --out runs/bench_rl_against
+    python experiments/bench_rl.py --envs 4096 --modes none,fots,table32 --device cuda --out runs/bench_rl_warp
     python experiments/bench_rl.py --frames --envs 512 --device cuda --out runs/bench_rl_cuda
 
-Modes: ``none`` (no touch), ``fots`` (9 x 11 marker displacements), ``table32`` (32 x 32 images of the Taxim table), ``raytrace64``
-(64 x 64 ray-traced images). The policy is the multilayer perceptron of stable-baselines3's PPO, 2 x 64, in NumPy, with random weights,
+Modes: ``none`` (no touch), ``fots`` (9 x 11 marker displacements), ``touch`` (these and the wrench), ``table32`` (32 x 32 images of the
+Taxim table), ``raytrace64`` (64 x 64 ray-traced images), ``raytrace320`` (320 x 240 of these). The policy is the multilayer perceptron
+of stable-baselines3's PPO, 2 x 64, in NumPy, with random weights,
 a tenth of whose first two actions is taken and whose third is replaced by what presses the pad onto the cube with about 1 N: a random
 policy would hardly touch it, and contact is what costs. Medians over steps; ``pressed`` says in how many environments the pad was touched.
 
@@ -14,6 +16,9 @@ policy would hardly touch it, and contact is what costs. Medians over steps; ``p
 processes of their own, the order changing from round to round. ``push.<mode>.speedup_vs_<name>`` is the median over rounds of the ratio
 of both figures, ``name`` being the commit, and ``.speedup_least`` and ``.speedup_most`` are the extremes. With ``ball`` among the modes
 ``experiments/ball_rolling.py`` with the rigid pad takes turns too: ``ball_rolling.rigid.speedup_vs_<name>``.
+
+With ``--device cuda`` worlds are those of MuJoCo Warp and all stays on the device, the policy in PyTorch too; keys begin with ``gpu.``
+and times are the mean over steps, since nothing waits in between.
 
 ``--frames`` leaves physics out: how many images of ``--size`` a second of ``--envs`` pads that are pressed, each differently? The gel's
 heights are on the device when the clock starts; cut, difference to rest and hand-over to PyTorch (DLPack) are in the time, and the image
@@ -35,6 +40,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.running import recorded, run
+from raytac.checks import check_known
 from raytac.device import resolve_device
 from raytac.envs import PushCubeVectorEnv
 from raytac.errors import InputError, RaytacError
@@ -48,11 +54,16 @@ from raytac.shapes import object_height, primitive
 MODES: dict[str, ObservationSettings | None] = {
     "none": None,
     "fots": ObservationSettings(("markers",)),
+    "touch": ObservationSettings(("markers", "wrench")),
     "table32": ObservationSettings(("rgb",), resolution=(32, 32), optics="taxim"),
     "raytrace64": ObservationSettings(("rgb",), resolution=(64, 64), optics="raytrace"),
+    "raytrace320": ObservationSettings(("rgb",), resolution=(320, 240), optics="raytrace"),
 }
 
 
+TIMED = ("fots", "table32", "raytrace64")
+"""Modes that are timed if none is named."""
+ENGINES = ("auto", "mujoco", "mujoco_warp")
 BALL, BALL_KEY = "ball", "steps_per_s"
 BALL_STEPS = 3000
 """Control steps of a ball's run: all goals."""
@@ -67,7 +78,7 @@ class Args(CommonOptions):
     envs: int = 16
     """Number of environments."""
     modes: str = ""
-    """What is observed, joined by commas; all but ``none`` if empty."""
+    """What is observed, joined by commas; fots, table32 and raytrace64, or with ``--frames`` all, if empty."""
     steps: int = 60
     """Steps, or calls with ``--frames``, that are timed, after a third as many to press the pad on or to record the kernels."""
     frames: bool = False
@@ -76,6 +87,10 @@ class Args(CommonOptions):
     """Of these images."""
     sensor: str = "gelsight_mini"
     """That makes them."""
+    engine: str = "auto"
+    """``mujoco``: worlds on the CPU, images on ``--device``; ``mujoco_warp``: all on ``--device``; ``auto``: the latter on CUDA."""
+    launches: int | None = None
+    """Steps of MuJoCo Warp in a control step, as many as the scene's if not given. Of more a world divides one where something is fast."""
     against: Path | None = None
     """Checkout of another commit to take turns with."""
     rounds: int = 3
@@ -86,9 +101,11 @@ def main(args: Args) -> dict[str, Metric]:
     """Run all and write ``metrics.json``."""
     known = tuple(FRAMES) if args.frames else tuple(MODES)
     if args.against is not None:
-        return compare(args, parse_names(args.modes or ",".join((*MODES, BALL)), "modes", (*MODES, BALL)))
-    names = parse_names(args.modes or ",".join(name for name in known if name != "none"), "modes", known)
+        return compare(args, parse_names(args.modes or ",".join((*TIMED, BALL)), "modes", (*MODES, BALL)))
+    names = parse_names(args.modes or ",".join(FRAMES if args.frames else TIMED), "modes", known)
     device = resolve_device(args.device)
+    check_known("engine", args.engine, ENGINES)
+    on_device = args.engine == "mujoco_warp" or (args.engine == "auto" and device == "cuda" and not args.frames)
     parse_resolution(args.size)
     with recorded(args, "bench_rl", device=device, owned=("metrics.json",), packages=("gymnasium",)) as (_, metrics):
         metrics |= {"envs": args.envs, "steps": args.steps, **machine()}
@@ -98,8 +115,9 @@ def main(args: Args) -> dict[str, Metric]:
                 metrics |= {f"{where}.{name}.{key}": value for key, value in frames(FRAMES[name], args).items()}
                 print(f"{name}: {metrics[f'{where}.{name}.frames_per_s']:.0f} frames/s")
             else:
-                metrics |= {f"push.{name}.{key}": value for key, value in timed(MODES[name], args).items()}
-                print(f"{name}: {metrics[f'push.{name}.env_steps_per_s']:.0f} environment steps/s")
+                where, run_mode = ("gpu." if device == "cuda" else "warp.", timed_on_device) if on_device else ("", timed)
+                metrics |= {f"{where}push.{name}.{key}": value for key, value in run_mode(MODES[name], args).items()}
+                print(f"{name}: {metrics[f'{where}push.{name}.env_steps_per_s']:.0f} environment steps/s", flush=True)
     return metrics
 
 
@@ -195,6 +213,56 @@ def timed(tactile: ObservationSettings | None, args: Args) -> dict[str, Metric]:
         "env_steps_per_s_best": args.envs / float(min(wall)),
         "pressed": float(np.mean(pressed)),
         **found,
+    }
+
+
+def timed_on_device(tactile: ObservationSettings | None, args: Args) -> dict[str, Metric]:
+    """Keys of one mode on MuJoCo Warp: all is on the device, from the policy's networks to the next observation."""
+    import torch  # pyright: ignore[reportMissingImports]  # gigabytes: the checks run without it
+
+    from raytac.envs import PushCube, WarpBatch
+
+    begin = time.perf_counter()
+    batch = WarpBatch(PushCube(), num_envs=args.envs, tactile=tactile, seed=args.seed, device=args.device, launches=args.launches)
+    observation = batch.reset(args.seed)
+    rng, size = np.random.default_rng(0), sum(values[0].numel() for values in observation.values())
+    weights = [
+        torch.tensor(rng.normal(0.0, a**-0.5, (a, b)), dtype=torch.float32, device=batch.device)
+        for a, b in itertools.pairwise((size, 64, 64, batch.size))
+    ]
+    pressed, failed = (torch.zeros((), dtype=torch.float64, device=batch.device) for _ in range(2))
+
+    def step() -> None:
+        """One step of all environments, with the policy of ``timed``."""
+        nonlocal observation
+        action = torch.cat([v.reshape(len(v), -1) / (255 if v.dtype == torch.uint8 else 1) for v in observation.values()], dim=1)
+        for weight in weights:
+            action = torch.tanh(action @ weight)
+        force = -batch.wrench["sensor"][:, 2]
+        action[:, :2] *= 0.1
+        action[:, 2] = (0.3 * (force - 1.0)).clamp(-1.0, 1.0)
+        result = batch.step(action)
+        observation = result.observation
+        pressed.add_((force > 0.0).double().mean())
+        failed.add_(result.failed.sum())
+
+    for _ in range(args.steps // 3):
+        step()
+    batch.check()
+    prepared = time.perf_counter() - begin
+    pressed.zero_()
+    failed.zero_()
+    begin = time.perf_counter()
+    for _ in range(args.steps):
+        step()
+    batch.check()  # it waits for the device
+    wall = time.perf_counter() - begin
+    return {
+        "env_steps_per_s": args.envs * args.steps / wall,
+        "ms_per_step": 1e3 * wall / args.steps,
+        "pressed": float(pressed) / args.steps,
+        "failed": int(failed),
+        "prepared_s": prepared,
     }
 
 

@@ -3,7 +3,9 @@
     python experiments/rigid_hard_cases.py --out runs/rigid_hard                       # the quick set
     python experiments/rigid_hard_cases.py --cases "drop_50g*,pin" --out runs/rigid_hard_some
     python experiments/rigid_hard_cases.py --full --out runs/rigid_hard_full           # all combinations, 10,000 grasps; resumes
-    python experiments/rigid_hard_cases.py --full --cases "grasps_coin*" --out runs/coin      # a part of it, for one of several processes
+    python experiments/rigid_hard_cases.py --full --cases "grasps*" --processes 16 --minutes 8 --out runs/grasps
+    python experiments/rigid_hard_cases.py --full --part 1/2 --out runs/half      # every second case, for one of two machines
+    python experiments/rigid_hard_cases.py --combine runs/grasps runs/half --out runs/rigid_hard_full
 
 Every case makes three checks beside its own: no environment fails, no body passes the face that the gel is bonded to (its underside over
 the pad, at every sub-step), and the friction of MuJoCo's contacts of the gel stays within 1 % of its cone. The others, with their bounds:
@@ -17,8 +19,9 @@ the pad, at every sub-step), and the friction of MuJoCo's contacts of the gel st
 - grips: the load is carried within 1e-4, at most 20 µm of creep, depth as in a press;
 - reversals: a spring drags a block to and fro: friction is μN both ways within 2 %, and never gives energy back that was not stored.
 
-Writes ``metrics.json`` (``rigid_hard.passed``, ``rigid_hard.total``, ``rigid_hard.max_penetration_of_bond_m``, and of every case its
-checks), ``table.txt`` and ``rigid_hard.png``; ``cases.json`` keeps the cases that are done.
+Writes ``metrics.json`` (``rigid_hard.passed``, ``rigid_hard.total``, ``rigid_hard.max_penetration_of_bond_m``, names of cases that
+fail in ``rigid_hard.failing``, grasps and their time by shape, and of every case its checks), ``table.txt`` and ``rigid_hard.png``;
+``cases.json`` keeps the cases that are done. ``rigid_hard.missing`` counts those that were asked for and are not.
 """
 
 from __future__ import annotations
@@ -28,8 +31,8 @@ import re
 import time
 import traceback
 import warnings
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -49,7 +52,8 @@ from experiments.rigid_hard_bench import (
     press_depth,
     within_grip,
 )
-from experiments.running import resumed, run, store
+from experiments.running import record_of, resumed, run, store
+from experiments.spreading import spread
 from raytac.device import resolve_device
 from raytac.errors import InputError, RaytacError
 from raytac.io import CommonOptions, FolderLock, Metric, versions, write_metrics
@@ -64,6 +68,8 @@ UPRIGHT = (0.7071067811865476, 0.7071067811865476, 0.0, 0.0)
 """A cylinder's axis along y."""
 OBJECTS = ("sphere", "cylinder", "edge", "cone", "torus", "pins", "coin", "mesh")
 """Shipped objects of the random grasps."""
+SLOW = ("grasps_coin_*", "grasps_mesh_*")
+"""Cases that take longest, and so begin first where processes share the cases."""
 PIECE = 128
 """Most grasps of one case: a long run is resumed, and divided among processes, by cases."""
 THIN = 0.03e-3
@@ -84,43 +90,154 @@ class Args(CommonOptions):
     """Number of random grasps; 0: 48, with ``--full`` 10,000."""
     seconds: float = 1.0
     """Factor of every time that something is held; below 1 the bounds mean less."""
+    part: str = "1/1"
+    """Every n-th of these cases from the i-th on, as i/n."""
+    processes: int = 1
+    """Processes that share the cases, on one core each and without a GPU."""
+    minutes: float = np.inf
+    """Time after which processes break off; the same command goes on with what is missing. With one process there is no such end."""
+    combine: tuple[Path, ...] = ()
+    """Folders of runs with equal settings and different cases, to be put together in ``--out``; nothing is run."""
 
 
 def main(args: Args) -> dict[str, Metric]:
-    """Run what is missing and write the results."""
+    """Run what is missing, or put runs together, and write the results."""
+    check(args)
+    start, out = time.perf_counter(), args.out or Path("runs/rigid_hard")
+    if args.combine:
+        args, rows = combined(args)
+        names = chosen(args)
+        if (out / "cases.json").exists():
+            raise InputError("out", value=out, rule="holds a run already: choose another folder for the combined one")
+        with FolderLock(out):
+            store(out / "cases.json", settings_of(args), list(rows.values()))
+            return written(args, out, names, rows, start)
+    names = chosen(args)
+    with FolderLock(out):
+        rows = {row["case"]: row for row in resumed(out / "cases.json", settings_of(args))}
+        for count, row in enumerate(results(args, names, rows), 1):
+            rows[row["case"]] = row
+            store(out / "cases.json", settings_of(args), list(rows.values()))
+            print(f"{count:4}/{len(names)} {line(row)}", flush=True)
+        return written(args, out, names, rows, start)
+
+
+def check(args: Args) -> None:
+    """Refuse values that no run has."""
     if not 0.0 < args.seconds <= 1.0:
         raise InputError("seconds", value=args.seconds, rule="must be greater than 0 and at most 1")
     if args.grasps < 0:
         raise InputError("grasps", value=args.grasps, rule="must be 0 or more")
-    start, cases = time.perf_counter(), all_cases(args)
+    if args.processes < 1:
+        raise InputError("processes", value=args.processes, rule="must be 1 or more")
+    if not args.minutes > 0.0:
+        raise InputError("minutes", value=args.minutes, rule="must be greater than 0")
+    if args.minutes < np.inf and args.processes == 1:
+        raise InputError("minutes", value=args.minutes, rule="is for two processes or more: one is not broken off")
+    part_of(args)
+
+
+def part_of(args: Args) -> tuple[int, int]:
+    """Number of the part from 1 on, and of parts."""
+    match = re.fullmatch(r"([1-9][0-9]*)/([1-9][0-9]*)", args.part)
+    if match is None or int(match[1]) > int(match[2]):
+        raise InputError("part", value=args.part, rule="must be i/n with 1 <= i <= n")
+    return int(match[1]), int(match[2])
+
+
+def chosen(args: Args) -> list[str]:
+    """Names of the cases of a run: those of the patterns and of the part, slow ones first where processes share them."""
+    cases, (part, parts) = all_cases(args), part_of(args)
     patterns = [p.strip() for p in args.cases.split(",") if p.strip()] or ["*"]
     for pattern in patterns:
         if not fnmatch.filter(cases, pattern):
             raise InputError("cases", value=pattern, rule="must be the name or a pattern of cases", choices=tuple(cases))
-    names = [name for name in cases if any(fnmatch.fnmatch(name, pattern) for pattern in patterns)]
-    out = args.out or Path("runs/rigid_hard")
-    settings = {"full": args.full, "seed": args.seed, "grasps": args.grasps, "seconds": args.seconds}
-    with FolderLock(out):
-        rows = {row["case"]: row for row in resumed(out / "cases.json", settings)}
-        for name in names:
-            if name not in rows:
-                rows[name] = measured(name, cases[name])
-                store(out / "cases.json", settings, list(rows.values()))
-            print(line(rows[name]), flush=True)
-        done = [rows[name] for name in names]
-        agreements = agreement(done)
-        for row in agreements:
-            print(line(row), flush=True)
-        done += agreements
-        metrics = summary(done)
-        (out / "table.txt").write_text(table(done), encoding="utf-8")
-        from experiments.rigid_hard_figure import draw
+    names = [name for name in cases if any(fnmatch.fnmatch(name, pattern) for pattern in patterns)][part - 1 :: parts]
+    if args.processes > 1:
+        names.sort(key=lambda name: not any(fnmatch.fnmatch(name, pattern) for pattern in SLOW))
+    return names
 
-        draw(done, out / "rigid_hard.png")
-        common: dict[str, Metric] = {"experiment": "rigid_hard", "device": resolve_device(args.device, ray_tracing=False)}
-        common |= {"seed": args.seed, "full": int(args.full), **machine(), **versions()}
-        write_metrics(out / "metrics.json", common | metrics | {"wall_s": time.perf_counter() - start})
-    print(f"{metrics['rigid_hard.passed']} of {metrics['rigid_hard.total']} cases pass; written: {out}")
+
+def settings_of(args: Args) -> dict[str, Any]:
+    """What the cases of a run depend on."""
+    return {"full": args.full, "seed": args.seed, "grasps": args.grasps, "seconds": args.seconds}
+
+
+def results(args: Args, names: Sequence[str], rows: dict[str, Row]) -> Iterator[Row]:
+    """Rows of the cases: those that are there, then those that are measured."""
+    cases, missing = all_cases(args), [name for name in names if name not in rows]
+    if args.processes == 1:
+        for name in names:
+            yield rows[name] if name in rows else measured(name, cases[name])
+        return
+    yield from [rows[name] for name in names if name in rows]
+    if missing:
+        work, first = partial(measured_case, args), partial(grasps, "sphere", 1, args.seed, 0)
+        yield from spread(work, missing, min(args.processes, len(missing)), first=first, seconds=60.0 * args.minutes)
+
+
+def measured_case(args: Args, name: str) -> Row:
+    """The row of one case, in a process that has none of the others."""
+    return measured(name, all_cases(args)[name])
+
+
+def combined(args: Args) -> tuple[Args, dict[str, Row]]:
+    """Settings and rows of the runs in folders.
+
+    Raises:
+        InputError: a folder without a run, runs with different settings, or a case in two of them.
+    """
+    settings, rows, first = {}, {}, args.combine[0]
+    for folder in args.combine:
+        kept, some = record_of(folder / "cases.json", "combine")
+        if folder is not first and kept != settings:
+            raise InputError(
+                "combine", value=folder, rule=f"holds a run with other settings than {first}: {kept}, not {settings}"
+            )
+        settings = kept
+        for row in some:
+            if row["case"] in rows:
+                raise InputError("combine", value=folder, rule=f"holds case {row['case']}, which another folder holds too")
+            rows[row["case"]] = row
+    return replace(args, **settings), rows
+
+
+def written(args: Args, out: Path, names: Sequence[str], rows: dict[str, Row], start: float) -> dict[str, Metric]:
+    """Metrics of a run from its rows by name, written with table and picture."""
+    done = [rows[name] for name in names if name in rows]
+    agreements = agreement(done)
+    for row in agreements:
+        print(line(row), flush=True)
+    done += agreements
+    metrics = summary(done) | grasp_metrics(all_cases(args), rows, names)
+    metrics["rigid_hard.missing"] = sum(name not in rows for name in names)
+    (out / "table.txt").write_text(table(done), encoding="utf-8")
+    from experiments.rigid_hard_figure import draw
+
+    draw(done, out / "rigid_hard.png")
+    common: dict[str, Metric] = {"experiment": "rigid_hard", "device": resolve_device(args.device, ray_tracing=False)}
+    common |= {"seed": args.seed, "full": int(args.full), **machine(), **versions()}
+    write_metrics(out / "metrics.json", common | metrics | {"wall_s": time.perf_counter() - start})
+    if metrics["rigid_hard.failing"]:
+        print(f"failing: {metrics['rigid_hard.failing']}")
+    missing = metrics["rigid_hard.missing"]
+    rest = f"; {missing} are missing: the same command goes on with them" if missing else ""
+    print(f"{metrics['rigid_hard.passed']} of {metrics['rigid_hard.total']} cases pass{rest}; written: {out}")
+    return metrics
+
+
+def grasp_metrics(cases: dict[str, Callable[[], Outcome]], rows: dict[str, Row], names: Sequence[str]) -> dict[str, Metric]:
+    """Number of grasps that were made, and seconds of a core for one, by shape; printed too."""
+    metrics: dict[str, Metric] = {"rigid_hard.grasps": 0}
+    for thing in OBJECTS:
+        mine = [name for name in names if name.startswith(f"grasps_{thing}_") and name in rows]
+        count = sum(cases[name].args[1] for name in mine)  # type: ignore[attr-defined]
+        if not count:
+            continue
+        seconds = sum(rows[name]["cpu_s"] for name in mine) / count
+        metrics |= {f"rigid_hard.grasps.{thing}.count": count, f"rigid_hard.grasps.{thing}.seconds_each": seconds}
+        metrics["rigid_hard.grasps"] = int(metrics["rigid_hard.grasps"]) + count
+        print(f"{thing:10} {count:6} grasps, {seconds:.3f} s of a core each")
     return metrics
 
 
@@ -171,6 +288,7 @@ def summary(rows: list[Row]) -> dict[str, Metric]:
     """Keys of ``metrics.json``."""
     reach = [row["penetration_m"] for row in rows if row["penetration_m"] is not None]
     metrics: dict[str, Metric] = {"rigid_hard.passed": sum(row["passed"] for row in rows), "rigid_hard.total": len(rows)}
+    metrics["rigid_hard.failing"] = " ".join(row["case"] for row in rows if not row["passed"])
     if reach:
         metrics["rigid_hard.max_penetration_of_bond_m"] = max(reach)
     for row in rows:

@@ -19,7 +19,7 @@ from raytac.device import resolve_device
 from raytac.errors import InputError, RaytacError
 from raytac.io import VERSIONED, CommonOptions, Metric, result_folder, versions, write_atomic, write_metrics
 
-__all__ = ["recorded", "resumed", "run", "store"]
+__all__ = ["record_of", "recorded", "resumed", "run", "store"]
 
 Args = TypeVar("Args")
 
@@ -79,11 +79,20 @@ def resumed(path: Path, settings: Mapping[str, object]) -> list[dict[str, Any]]:
     """
     if not path.exists():
         return []
-    try:
-        record = json.loads(path.read_text("utf-8"))
-        kept, rows = record["settings"], list(record["rows"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError("out", value=path, rule=f"is no record of such a run ({error}): move it away") from error
+    kept, rows = record_of(path, "out")
     if kept != settings:
         raise InputError("out", value=path, rule=f"holds a run with other settings, {kept}: choose another")
     return rows
+
+
+def record_of(path: Path, name: str) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Settings and rows that a run stored.
+
+    Raises:
+        InputError: there are none, or they are damaged; the error is of the option ``name``.
+    """
+    try:
+        record = json.loads(path.read_text("utf-8"))
+        return dict(record["settings"]), list(record["rows"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(name, value=path, rule=f"is no record of such a run ({error}): move it away") from error

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from experiments.running import recorded, run
-from raytac.envs import SCRIPTED, BalancePole, InsertPeg, LiftCube, OpenDrawer, PushCube, RollBall, Start, Task, TaskBatch
+from raytac.envs import SCRIPTED, BalancePole, InsertPeg, LiftCube, OpenDrawer, PushCube, RollBall, Starts, Task, TaskBatch
 from raytac.errors import InputError
 from raytac.io import CommonOptions
 from raytac.shapes import object_bounds
@@ -32,8 +32,10 @@ _HOWS = ("scripted", "pressed")
 class LiftHere(LiftCube):
     """The cube where the scene has it, between the pads, and a goal 40 mm above it."""
 
-    def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
-        return Start(body[:3, 3] + [0.0, 0.0, 0.04])
+    draws = 0
+
+    def starts(self, u: np.ndarray, tool: np.ndarray, body: np.ndarray) -> Starts:
+        return Starts(np.repeat(body[None, :3, 3] + [0.0, 0.0, 0.04], len(u), axis=0))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
     python experiments/train_gpu.py --task PushCube --seeds 0,1,2 --touch wrench,none --processes 16
     python experiments/train_gpu.py --task RollBall --minutes 5 --device cpu
+    python experiments/train_gpu.py --task PushCube --touch markers+wrench --worlds mujoco_warp --num-envs 4096 --device cuda
 
 The critic is asymmetric: in training it is given the body's pose and velocity and the wrenches of all sensors, whatever the policy is
 given. The policy never is. Each pair of touch and seed is one training in ``<out>/<touch>/seed<k>/``: ``progress.csv`` (one row some
@@ -9,7 +10,7 @@ iterations), ``evaluation.csv`` (held-out episodes of the deterministic policy),
 TensorBoard's events too, where it is installed. The same command again goes on from the checkpoint, after Ctrl-C, a crash or ``--minutes``.
 ``<out>/metrics.json`` has the trainings of all seeds: ``<device>.<task>.success`` is that of the worst.
 
-Worlds are stepped on the CPU, in ``--processes`` processes; ``--device`` is that of the networks.
+Worlds are stepped on the CPU, in ``--processes`` processes, or with ``--worlds mujoco_warp`` on ``--device``, where the networks are.
 """
 
 # pyright: reportMissingImports=false
@@ -32,7 +33,7 @@ import numpy as np
 
 import raytac.envs
 from experiments.running import run
-from raytac.checks import check_number, check_whole
+from raytac.checks import check_known, check_names, check_number, check_whole
 from raytac.errors import InputError
 from raytac.io import (
     VERSIONED,
@@ -45,6 +46,7 @@ from raytac.io import (
     write_atomic,
     write_metrics,
 )
+from raytac.observe import MODALITIES
 from raytac.report import machine, wilson_interval
 
 if multiprocessing.parent_process() is None:  # processes of environments import this file too, and need none of these
@@ -53,9 +55,10 @@ if multiprocessing.parent_process() is None:  # processes of environments import
     from rsl_rl.models import MLPModel
     from rsl_rl.storage import RolloutStorage
 
-    from raytac.envs import RslVecEnv
+    from raytac.envs import RslVecEnv, RslWarpEnv
 
 TASKS = ("PushCube", "BalancePole", "LiftCube", "RollBall")
+WORLDS = ("mujoco", "mujoco_warp")
 HISTORY = {"BalancePole": 3, "RollBall": 3}
 """Last observations that the policy is given, where it is more than one: what is known by touch alone shows in how it changes."""
 STEPS = {"PushCube": 1_000_000, "BalancePole": 4_000_000, "LiftCube": 6_000_000, "RollBall": 2_000_000}
@@ -83,6 +86,10 @@ class Args(CommonOptions):
     """Success on held-out episodes at which a training is done before its steps are."""
     num_envs: int = 512
     """Environments of each training."""
+    worlds: str = "mujoco"
+    """``mujoco``: on the CPU; ``mujoco_warp``: all environments on ``device``, without processes."""
+    launches: int | None = None
+    """Steps of MuJoCo Warp in a control step, as many as the scene's if not given. Of more a world divides one where something is fast."""
     processes: int = 0
     """Processes that these are spread over, one core each; 0: this process."""
     threads: int = 1
@@ -120,9 +127,16 @@ class Args(CommonOptions):
         for name in ("num_envs", "threads", "episodes", "evaluate_every", "rollout", "epochs", "minibatches", "hidden"):
             check_whole(name, getattr(self, name))
         check_whole("processes", self.processes, 0)
+        check_known("worlds", self.worlds, WORLDS)
         above, unit = dict.fromkeys(("learning_rate", "desired_kl", "clip", "deviation", "deviation_floor"), "(0, inf)"), "[0, 1]"
         for name, interval in {**above, "gamma": unit, "gae_lambda": unit, "entropy": "[0, inf)"}.items():
             check_number(name, getattr(self, name), interval)
+        for name in ("history", "steps"):
+            if getattr(self, name) is not None:
+                check_whole(name, getattr(self, name))
+        for touch in parse_names(self.touch, "touch"):
+            if touch not in ("none", "task"):
+                check_names("touch", touch.split("+"), MODALITIES)
         for name, interval in {"minutes": "(0, inf)", "target": "[0, 1]"}.items():
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), interval)
@@ -149,16 +163,20 @@ class Training:
         self._start = time.perf_counter()
         self.device = "cuda" if args.device == "auto" and torch.cuda.is_available() else args.device.replace("auto", "cpu")
         self.settings = _settings(args, touch, seed)
-        saved = self._saved()  # before any process is started
+        saved = _checkpoint(folder, self.settings, self.device)  # before any process is started
         self.steps, self.iteration = (0, 0) if saved is None else (saved["steps"], saved["iteration"])
         tactile: Any = {"none": None, "task": "task"}.get(touch, tuple(touch.split("+")))
-        self.env = RslVecEnv(
-            getattr(raytac.envs, f"{args.task}VectorEnv"),
-            num_envs=args.num_envs, processes=args.processes, device=self.device, seed=_seed(seed, 0),
-            history=self.settings["history"], tactile=tactile,
-        )  # fmt: skip
+        kind: Any = getattr(raytac.envs, f"{args.task}VectorEnv")
+        common: Any = {
+            "num_envs": args.num_envs, "device": self.device, "seed": _seed(seed, 0), "history": self.settings["history"],
+            "tactile": tactile,
+        }  # fmt: skip
+        if args.worlds == "mujoco":
+            self.env: RslVecEnv | RslWarpEnv = RslVecEnv(kind, processes=args.processes, **common)
+        else:
+            self.env = RslWarpEnv(kind, launches=args.launches, **common)
         # As Isaac Lab's: a reward is a rate, so that its sum over an episode is of the size of 1 to 100.
-        self.env.reward_scale = self.env.layout.control_timestep
+        self.env.reward_scale = self.env.control_timestep
         torch.manual_seed(seed)
         observation, groups = self.env.reset(), {"actor": ["actor"], "critic": ["critic"]}
         network = {"hidden_dims": [args.hidden, args.hidden], "activation": "elu", "obs_normalization": True}
@@ -198,30 +216,31 @@ class Training:
     def iterate(self) -> dict[str, float]:
         """One rollout and one update; returns what to log."""
         start, count = time.perf_counter(), self.args.rollout
-        ended = succeeded = failed = succeeding = reward = 0.0
-        terms: dict[str, float] = {}
+        sums: dict[str, torch.Tensor] = {}  # on the device: nothing waits within a rollout
         with torch.inference_mode():
             for _ in range(count):
                 observation, rewards, dones, extras = self.env.step(self.ppo.act(self.observation))
                 self.ppo.process_env_step(observation, rewards, dones, extras)
                 self.observation = observation
-                reward += float(rewards.mean())
-                ended, succeeded = ended + float(dones.sum()), succeeded + float((extras["success"] * dones).sum())
-                failed, succeeding = failed + float(extras["failed"].sum()), succeeding + float(extras["success"].mean())
-                for name, value in extras["log"].items():
-                    terms[name] = terms.get(name, 0.0) + value / count
+                now = {
+                    "reward": rewards.mean(), "ended": dones.sum(), "succeeded": (extras["success"] * dones).sum(),
+                    "failed": extras["failed"].sum(), "succeeding": extras["success"].mean(), **extras["log"],
+                }  # fmt: skip
+                sums = {name: value + sums.get(name, 0.0) for name, value in now.items()}
             self.ppo.compute_returns(self.observation)
+        totals = {name: float(value) for name, value in sums.items()}  # this waits
+        ended, succeeded, failed = (totals[name] for name in ("ended", "succeeded", "failed"))
         collected = time.perf_counter()
         losses = self.ppo.update()
         done = time.perf_counter()
         self.steps, self.iteration = self.steps + count * self.env.num_envs, self.iteration + 1
         return {
-            "steps": self.steps, "wall_s": round(self.wall_s, 2), "reward": reward / count, "ended": ended,
-            "success": succeeded / ended if ended else 0.0, "succeeding": succeeding / count, "failed": failed,
+            "steps": self.steps, "wall_s": round(self.wall_s, 2), "reward": totals["reward"] / count, "ended": ended,
+            "success": succeeded / ended if ended else 0.0, "succeeding": totals["succeeding"] / count, "failed": failed,
             "deviation": float(self.ppo.get_policy().output_std.detach().mean()), "learning_rate": self.ppo.learning_rate,
             **{f"loss_{name}": value for name, value in losses.items()},
             "env_steps_per_s": count * self.env.num_envs / (done - start), "collect_s": collected - start, "update_s": done - collected,
-            **{name.replace("/reward/", "term_"): value for name, value in terms.items()},
+            **{name.replace("/reward/", "term_"): value / count for name, value in totals.items() if name.startswith("/reward/")},
         }  # fmt: skip
 
     def log(self, row: Mapping[str, float]) -> None:
@@ -275,22 +294,6 @@ class Training:
             torch.save({**progress, **values}, stream)
             write_atomic(self.folder / f"{name}.pt", stream.getvalue())
 
-    def _saved(self) -> dict[str, Any] | None:
-        path = self.folder / "checkpoint.pt"
-        if not path.exists():
-            return None
-        try:
-            saved = torch.load(path, map_location=self.device, weights_only=True)
-            settings, *_ = (saved[name] for name in ("settings", "steps", "iteration", "wall_s", "actor_state_dict"))
-        except Exception as error:
-            raise InputError("out", value=path, rule=f"must be a checkpoint of train_gpu ({error})") from error
-        if settings != self.settings:
-            other = {k: v for k, v in settings.items() if v != self.settings.get(k)}
-            raise InputError(
-                "out", value=self.folder, rule=f"holds a training of other settings, with {other}: name another folder"
-            )
-        return saved
-
     @property
     def wall_s(self) -> float:
         """Seconds from the start, those before a resume too: worlds, compilation, rollouts, updates and evaluations."""
@@ -306,6 +309,10 @@ class Training:
 def train(args: Args, touch: str, seed: int, folder: Path) -> None:
     """One training, up to its steps, its target or the minutes; then the last evaluation."""
     start, total = time.perf_counter(), STEPS[args.task] if args.steps is None else args.steps
+    _checkpoint(folder, _settings(args, touch, seed), "cpu")
+    if _is_done(args, folder, total):
+        print(f"{args.task} {touch} seed {seed}: done before, in {folder}", flush=True)
+        return
     with FolderLock(folder), contextlib.closing(Training(args, touch, seed, folder)) as training:
         name, reached = f"{args.task} {touch} seed {seed}", False
         due = training.steps + args.evaluate_every
@@ -331,7 +338,8 @@ def train(args: Args, touch: str, seed: int, folder: Path) -> None:
         training.save()
         low, high = wilson_interval(result.successes, result.episodes)
         found: dict[str, Metric] = {
-            "env_steps": training.steps, "minutes": trained_s / 60.0, "episodes": result.episodes, "failed": result.failures,
+            "env_steps": training.steps, "done": int(reached or training.steps >= total), "minutes": trained_s / 60.0,
+            "episodes": result.episodes, "failed": result.failures,
             "success": result.successes / result.episodes, "success_low": low, "success_high": high, "return": result.mean_return,
             "length": result.mean_length, "env_steps_per_s": training.steps / trained_s, "processes": args.processes,
         }  # fmt: skip
@@ -379,6 +387,30 @@ def main(args: Args) -> dict[str, Metric]:
     return found
 
 
+def _checkpoint(folder: Path, settings: Mapping[str, Any], device: str) -> dict[str, Any] | None:
+    """The folder's checkpoint; None without. Raises ``InputError`` for one of other settings."""
+    path = folder / "checkpoint.pt"
+    if not path.exists():
+        return None
+    try:
+        saved = torch.load(path, map_location=device, weights_only=True)
+        kept, *_ = (saved[name] for name in ("settings", "steps", "iteration", "wall_s", "actor_state_dict"))
+    except Exception as error:
+        raise InputError("out", value=path, rule=f"must be a checkpoint of train_gpu ({error})") from error
+    if kept != settings:
+        other = {k: v for k, v in kept.items() if v != settings.get(k)}
+        raise InputError("out", value=folder, rule=f"holds a training of other settings, with {other}: name another folder")
+    return saved
+
+
+def _is_done(args: Args, folder: Path, total: int) -> bool:
+    """True for a training that has come to its end and was evaluated on as many episodes; one with more steps to do goes on."""
+    path = folder / "metrics.json"
+    row = read_metrics(path) if path.exists() else {}
+    reached = args.target is not None and float(row.get("success", 0.0)) >= args.target
+    return bool(row.get("done")) and int(row["episodes"]) >= args.episodes and (reached or int(row["env_steps"]) >= total)
+
+
 def _settings(args: Args, touch: str, seed: int) -> dict[str, Any]:
     """What a checkpoint must agree in to be gone on from: all that is not about where and for how long."""
     free = (
@@ -396,7 +428,7 @@ def _settings(args: Args, touch: str, seed: int) -> dict[str, Any]:
         "evaluate_every",
     )
     kept = {name: value for name, value in asdict(args).items() if name not in free}
-    return kept | {"touch": touch, "seed": seed, "history": args.history or HISTORY.get(args.task, 1)}
+    return kept | {"touch": touch, "seed": seed, "history": HISTORY.get(args.task, 1) if args.history is None else args.history}
 
 
 def _seed(seed: int, iteration: int) -> int:

@@ -9,8 +9,16 @@ import shutil
 import tempfile
 import warnings
 from pathlib import Path
+from threading import RLock
 
 import warp as wp
+
+LAUNCH = RLock()
+"""Held by threads that step a world or record launches, one at a time.
+
+On a CPU Warp has one recording a process, which takes in the loops and branches that another thread launches, and one place for the
+tiles of a kernel. On CUDA threads share a device's stream, of which a recording takes in everything.
+"""
 
 
 def start_warp() -> None:

@@ -19,13 +19,15 @@ from ipc.solver.newton import Newton
 from ipc.solver.patch_motion import RestPatches
 from ipc.solver.potential import Potential
 from ipc.state import State, env_mask, per_env, start_state, teleported, unit_pose
-from ipc.warp_start import start_warp
+from ipc.warp_start import LAUNCH, start_warp
 
 Floats = NDArray[np.float64]
 
 
 class World:
     """Bodies that deform, move and touch, in ``num_envs`` copies that do not see each other.
+
+    Threads may have a world each; their steps wait for each other.
 
     Args:
         bodies: of unique names.
@@ -66,8 +68,9 @@ class World:
             ) from error
         self.d_hat = self.settings.d_hat or 0.1 * self.layout.min_edge
         self.kappa = self.settings.kappa or self.layout.max_young or 1e5
-        self._potential = Potential(self.layout, self.settings, num_envs, self.d_hat, self.kappa, self.device)
-        self._newton = Newton(self._potential, self.layout, self.settings)
+        with LAUNCH:
+            self._potential = Potential(self.layout, self.settings, num_envs, self.d_hat, self.kappa, self.device)
+            self._newton = Newton(self._potential, self.layout, self.settings)
         self._failed = np.zeros(num_envs, bool)
         self._patches: dict[int, RestPatches] = {}
         frames = self.layout.frame_pose
@@ -145,12 +148,13 @@ class World:
         if dt is not None and not 0.0 < dt < np.inf:
             raise IpcError(f"dt = {dt}: it must be positive")
         pot, alive = self._potential, ~self._failed
-        pot.set_dt(dt or self.settings.dt)
-        if self._targets_set:
-            pot.goal_p.assign(self._goal_p)
-            pot.goal_q.assign(self._goal_q)
-            self._targets_set = False
-        values = self._newton.step(alive)
+        with LAUNCH:
+            pot.set_dt(dt or self.settings.dt)
+            if self._targets_set:
+                pot.goal_p.assign(self._goal_p)
+                pot.goal_q.assign(self._goal_q)
+                self._targets_set = False
+            values = self._newton.step(alive)
         self._failed |= values["failed"].astype(bool)
         return StepReport(
             converged=values["converged"].astype(bool),
@@ -344,28 +348,29 @@ class World:
                 raise IpcError(f"the state has {what} of shape {given}: this world has {needed}")
         check_overlap(self.layout, state, mask)
         quaternions = state.frame_rotation[..., [1, 2, 3, 0]]
-        for target, values in (
-            (s.y, state.y),
-            (s.v, state.velocity),
-            (s.frame_q, quaternions),
-            (s.goal_q, quaternions),
-            (s.frame_p, state.frame_position),
-            (s.goal_p, state.frame_position),
-            (s.kappa, state.kappa),
-        ):
-            merged = host(target).copy()
-            merged[mask] = values[mask]
-            target.assign(merged)
-        self._goal_p[mask], self._goal_q[mask] = state.frame_position[mask], quaternions[mask]
-        self._failed[mask] = state.failed[mask]
-        s.collision.forget(mask)
-        s.collision.drop(mask)
-        for forces in (s.gradient, s.vert_gradient):
-            kept = host(forces).copy()
-            kept[mask] = 0.0
-            forces.assign(kept)
-        s.set_frames(wp.zeros(self.num_envs, dtype=wp.float64, device=self.device), s.R, s.t)
-        s.place_vertices(s.y, s.R, s.t, s.x)
+        with LAUNCH:
+            for target, values in (
+                (s.y, state.y),
+                (s.v, state.velocity),
+                (s.frame_q, quaternions),
+                (s.goal_q, quaternions),
+                (s.frame_p, state.frame_position),
+                (s.goal_p, state.frame_position),
+                (s.kappa, state.kappa),
+            ):
+                merged = host(target).copy()
+                merged[mask] = values[mask]
+                target.assign(merged)
+            self._goal_p[mask], self._goal_q[mask] = state.frame_position[mask], quaternions[mask]
+            self._failed[mask] = state.failed[mask]
+            s.collision.forget(mask)
+            s.collision.drop(mask)
+            for forces in (s.gradient, s.vert_gradient):
+                kept = host(forces).copy()
+                kept[mask] = 0.0
+                forces.assign(kept)
+            s.set_frames(wp.zeros(self.num_envs, dtype=wp.float64, device=self.device), s.R, s.t)
+            s.place_vertices(s.y, s.R, s.t, s.x)
 
     def reset(self, envs: ArrayLike | None = None) -> None:
         """Put environments (a mask (B,), a list, or None for all) back to the start of the world."""

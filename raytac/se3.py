@@ -6,8 +6,10 @@ Poses that users give are checked here.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+from array_api_compat import array_namespace, device
 from numpy.typing import ArrayLike
 
 from raytac.checks import check_numbers
@@ -17,16 +19,20 @@ _ORTHONORMAL = 1e-6
 """Largest entry of RᵀR − 1 of a matrix R that counts as a rotation."""
 
 
-def pose(rotation: np.ndarray, position: ArrayLike) -> np.ndarray:
-    """``target_from_source`` (4, 4) from a rotation matrix (3, 3) and a position (3,) [m]."""
-    matrix = np.zeros((4, 4))  # np.eye takes three times as long
-    matrix[:3, :3], matrix[:3, 3], matrix[3, 3] = rotation, position, 1.0
+def pose(rotation: Any, position: Any) -> Any:
+    """``target_from_source`` (…, 4, 4) from rotation matrices and positions (…, 3) [m]; arrays of NumPy or PyTorch.
+
+    Rotations (…, 3, 3), or (3, 3) of one for all positions.
+    """
+    xp = array_namespace(rotation)
+    matrix = xp.zeros((*position.shape[:-1], 4, 4), dtype=rotation.dtype, device=device(rotation))
+    matrix[..., :3, :3], matrix[..., :3, 3], matrix[..., 3, 3] = rotation, position, 1.0
     return matrix
 
 
 def pose_of(position: ArrayLike, quaternion: ArrayLike) -> np.ndarray:
     """``target_from_source`` (4, 4) from a position (3,) [m] and a unit quaternion wxyz (4,)."""
-    return pose(rotation_of(quaternion), position)
+    return pose(rotation_of(quaternion), np.asarray(position))
 
 
 def pose_error(world_from_a: np.ndarray, world_from_b: np.ndarray) -> np.ndarray:
@@ -134,15 +140,20 @@ def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
     return u @ v
 
 
-def rotations(vectors: np.ndarray) -> np.ndarray:
-    """Rotation matrices (…, 3, 3) of rotation vectors (…, 3) [rad] (Rodrigues' formula)."""
-    shape, vectors = vectors.shape, vectors.reshape(-1, 3)
-    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    half = 0.5 * np.sinc(0.5 * angle / np.pi) ** 2  # (1 − cos a)/a²
-    return (np.eye(3) + np.sinc(angle / np.pi) * cross + half * cross @ cross).reshape(*shape, 3)
+def rotations(vectors: Any) -> Any:
+    """Rotation matrices (…, 3, 3) of rotation vectors (…, 3) [rad] (Rodrigues' formula); arrays of NumPy or PyTorch."""
+    xp = array_namespace(vectors)
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    angle = xp.sqrt(x * x + y * y + z * z)
+    some = angle > 0.0
+    length = xp.where(some, angle, 1.0)
+    first, half = xp.where(some, xp.sin(angle) / length, 1.0), xp.where(some, xp.sin(0.5 * angle) / (0.5 * length), 1.0)
+    second = 0.5 * half * half  # (1 − cos a)/a², without cancellation
+    xy, yz, zx = second * x * y, second * y * z, second * z * x
+    xx, yy, zz = (1.0 - second * (angle * angle - c * c) for c in (x, y, z))
+    sx, sy, sz = first * x, first * y, first * z
+    rows = (xx, xy - sz, zx + sy, xy + sz, yy, yz - sx, zx - sy, yz + sx, zz)
+    return xp.reshape(xp.stack(rows, axis=-1), (*vectors.shape[:-1], 3, 3))
 
 
 def batch_of(world_from_pad: ArrayLike, axes: int, bodies: Mapping[str, ArrayLike]) -> int:

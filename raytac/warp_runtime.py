@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from threading import Lock
+from threading import RLock
 from typing import Any
 
 import warp as wp
 
 from raytac.installation import foreign_ipc
 
-LAUNCH = Lock()
-"""Lock of launches with tiles: on a CPU Warp keeps tiles in one place of the process."""
+
+def _shared_lock() -> Any:
+    """The solver's lock of launches; where another package hides ``ipc``, there are no launches of its own."""
+    if foreign_ipc() is not None:
+        return RLock()
+    from ipc.warp_start import LAUNCH as SHARED
+
+    return SHARED
+
+
+LAUNCH = _shared_lock()
+"""Held by recordings, and by launches that are recorded or have tiles.
+
+On the CPU Warp has one recording and one place for tiles a process, where threads would meet.
+"""
 
 
 def start_warp() -> None:
@@ -33,7 +46,7 @@ class Recorded:
         """Record what functions launch; they must hold its arrays, as a ``partial`` does."""
         start_warp()
         self._launches = launches  # the graph itself keeps no array alive
-        with wp.ScopedCapture(device=device) as capture:
+        with LAUNCH, wp.ScopedCapture(device=device) as capture:
             for launch in launches:
                 launch()
         self._graph: Any = capture.graph

@@ -20,6 +20,7 @@ PLACES: dict[str, tuple[str, ...]] = {
     "renderer": (
         "calibrate",
         "dataset/test_renderer.py",
+        "envs/test_rsl_warp.py",
         "io/test_code_digest.py",
         "markers/test_calibration.py",
         "markers/test_dots.py",
@@ -45,6 +46,8 @@ PLACES: dict[str, tuple[str, ...]] = {
         "view/test_view_command.py",
     ),
     "solver": (
+        "envs/test_rsl_warp.py",
+        "envs/test_warp_batch.py",
         "ipc",
         "markers/test_other_models.py",
         "physics/rigid/test_pad_search.py",
@@ -56,6 +59,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "physics/test_soft_scene.py",
         "regression",
         "test_sensor_soft.py",
+        "test_threads.py",
         "test_warp_runtime.py",
         "world/engine",
         "world/test_held.py",

@@ -25,11 +25,14 @@ from .roll_ball import RollBall as RollBall
 from .roll_ball import RollBallEnv as RollBallEnv
 from .roll_ball import RollBallVectorEnv as RollBallVectorEnv
 from .rsl import RslVecEnv as RslVecEnv
+from .rsl import RslWarpEnv as RslWarpEnv
 from .sb3 import ProcessVecEnv as ProcessVecEnv
 from .sb3 import TactileVecEnv as TactileVecEnv
 from .scripted import SCRIPTED as SCRIPTED
 from .task_rules import Motion as Motion
-from .task_rules import Start as Start
+from .task_rules import Starts as Starts
 from .task_rules import Task as Task
 from .task_rules import TaskResult as TaskResult
 from .task_rules import TaskState as TaskState
+from .warp_batch import WarpBatch as WarpBatch
+from .warp_batch import WarpStep as WarpStep

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from raytac.envs.action_targets import ToolTargets, joint_targets
 from raytac.envs.task_rules import Motion
 from raytac.errors import InputError
 from raytac.robots.ik import PoseServo
@@ -20,7 +21,6 @@ from raytac.robots.joint_springs import JointSprings
 from raytac.robots.panda import MAX_VELOCITY
 from raytac.robots.pose_errors import PoseErrors
 from raytac.robots.states import StateReader, numbers
-from raytac.se3 import rotations
 from raytac.world.world import TactileWorld
 from raytac.world.world_state import BatchController
 
@@ -32,9 +32,8 @@ joints, by up to ``Motion.joint_step`` a step, and the opening if there is one."
 class ActionControl:
     """Targets of B environments.
 
-    With ``pose`` an action moves the target by ``action * step``. The target never leads the tool by more than the leash, leaves the box
-    or turns further than the motion allows; axes that no action moves stay as they started. Damped least squares turn it into joint
-    targets once a control step, and springs in the joints follow these in every step of MuJoCo.
+    With ``pose`` actions move ``ToolTargets``. Damped least squares turn them into joint targets once a control step, and springs in the
+    joints follow these in every step of MuJoCo.
     """
 
     def __init__(self, world: TactileWorld, motion: Motion, action: str) -> None:
@@ -49,8 +48,7 @@ class ActionControl:
         opening = composed.opening
         self._springs = JointImpedance(self.arm, frequency=motion.frequency).springs(data, () if opening is None else (opening,))
         self._servo = PoseServo(self.arm, max_velocity=np.array(MAX_VELOCITY), posture=self._posture)
-        self._has_grip = "grip" in motion.axes
-        fingers = np.arange(world.model.nq)[composed.fingers] if self._has_grip else np.zeros(0, int)
+        fingers = np.arange(world.model.nq)[composed.fingers] if "grip" in motion.axes else np.zeros(0, int)
         arm = self.arm.numbers()
         known = {
             "time": arm["time"],
@@ -60,46 +58,32 @@ class ActionControl:
             "fingers": numbers("qpos", fingers),
         }
         self._reader = StateReader(data, known)
-        self.size = len(motion.axes) if action == "pose" else len(self.arm) + self._has_grip
-        self.opening_range = motion.opening if self._has_grip else ()
-        count = world.num_envs
-        self._target = np.repeat(np.eye(4)[None], count, axis=0)
-        self._turn = np.zeros((count, 3))
+        has_grip, count = "grip" in motion.axes, world.num_envs
+        self.size = len(motion.axes) if action == "pose" else len(self.arm) + has_grip
+        self.opening_range = motion.opening if has_grip else ()
         self._joints = np.repeat(self._posture[None], count, axis=0)
-        self._gap = np.zeros(count)
         self._errors = PoseErrors(count)
-        moved = {"xyz".index(axis): k for k, axis in enumerate(motion.axes) if axis in "xyz"}
-        self._axes, self._moves = list(moved), list(moved.values())
-        self._step, self._low, self._high = (
-            np.array(values)[index]
-            for values, index in ((motion.step, self._moves), (motion.low, self._axes), (motion.high, self._axes))
-        )
-        self._turns = [
-            ("xyz".index(axis[1]), k, motion.step[k]) for k, axis in enumerate(motion.axes) if axis not in ("x", "y", "z", "grip")
-        ]
-        self._start = self.state().tool[0].copy()
+        self._targets = ToolTargets(motion, self.state().tool, 0.0 if opening is None else float(composed.ctrl[opening]))
         self.reset(range(count))
 
     @property
     def target(self) -> np.ndarray:
         """Target poses (B, 4, 4) of the tool; with ``action="joints"`` they stay where the episode began."""
-        return self._target.copy()
+        return self._targets.pose.copy()
 
     def state(self) -> ToolState:
         """Present state of tool, joints and fingers."""
         now = self._reader.values()
         fingers = now["fingers"]
-        opening = fingers.sum(axis=1, keepdims=True) if self._has_grip else fingers
+        opening = fingers.sum(axis=1, keepdims=True) if self.opening_range else fingers
         return ToolState(now["time"], now["tool"], now["joints"], now["speed"], opening)
 
     def reset(self, envs: Sequence[int] | range) -> None:
         """Set the targets of environments to their present poses."""
-        chosen = list(envs)
-        self._target[chosen], self._turn[chosen] = self.state().tool[chosen], 0.0
-        self._joints[chosen] = self._posture
-        opening = self.world.composed.opening
-        if opening is not None:
-            self._gap[chosen] = self.world.composed.ctrl[opening]
+        mask = np.zeros(self.world.num_envs, bool)
+        mask[list(envs)] = True
+        self._targets.begin(mask, self.state().tool)
+        self._joints[mask] = self._posture
 
     def controller(self, actions: np.ndarray) -> BatchController:
         """Controller of all environments for the next control step; ``actions`` (B, size) in [−1, 1].
@@ -108,37 +92,16 @@ class ActionControl:
         """
         dt, now = self.world.composed.control_timestep, self.state()
         if self.action == "pose":
-            before = self._target.copy()
-            self._move_pose(actions, now.tool[:, :3, 3])
-            joints, speed = self._servo.targets(self.world.data, before, self._errors((self._target, before))[0] / dt, dt)
+            before = self._targets.pose
+            self._targets.move(actions, now.tool[:, :3, 3])
+            joints, speed = self._servo.targets(self.world.data, before, self._errors((self._targets.pose, before))[0] / dt, dt)
         else:
-            target = self._joints + self.motion.joint_step * actions[:, : len(self.arm)]
-            target = np.clip(target, now.joints - self.motion.joint_leash, now.joints + self.motion.joint_leash)
-            target = np.clip(target, self.arm.range[:, 0], self.arm.range[:, 1])
+            target = joint_targets(self.motion, actions[:, : len(self.arm)], self._joints, now.joints, self.arm.range)
             joints, speed = self._joints, (target - self._joints) / dt
             self._joints = target
-        if self._has_grip:
-            step = self.motion.step[self.motion.axes.index("grip")]
-            low, high = self.motion.opening
-            self._gap = np.clip(self._gap + step * actions[:, -1], low, high)
-        self._springs.aim(joints, speed, now.time, self._gap[:, None])
+        self._targets.grip(actions)
+        self._springs.aim(joints, speed, now.time, self._targets.gap[:, None])
         return _Follow(self._springs)
-
-    def _move_pose(self, actions: np.ndarray, tool: np.ndarray) -> None:
-        motion, i = self.motion, self._axes
-        tool, position = tool[:, i], self._target[:, i, 3] + self._step * actions[:, self._moves]
-        for low, high in ((tool - motion.leash, tool + motion.leash), (self._low, self._high)):
-            position = np.minimum(np.maximum(position, low), high)
-        self._target[:, i, 3] = position
-        if not self._turns:
-            return
-        turn = self._turn
-        for axis, k, step in self._turns:
-            turn[:, axis] += step * actions[:, k]
-        length = np.linalg.norm(turn, axis=1)
-        turn *= np.minimum(1.0, motion.turn / np.maximum(length, 1e-9))[:, None]
-        turned = length > 0.0
-        self._target[turned, :3, :3] = rotations(turn[turned]) @ self._start[:3, :3]
 
 
 @dataclass(frozen=True)

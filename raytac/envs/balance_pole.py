@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
-import numpy as np
+from array_api_compat import array_namespace
 
 from raytac.envs.environments import TactileEnv, TactileVectorEnv
-from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, distances
+from raytac.envs.task_rules import Array, Motion, Starts, Task, TaskResult, TaskState, between, distances
 from raytac.se3 import pose, rotations
 
 
@@ -19,29 +20,33 @@ class BalancePole(Task):
     motion: ClassVar = Motion(("x", "y"), (2e-3, 2e-3), (0.35, -0.10, 0.55), (0.55, 0.10, 0.55), leash=0.02)
     max_episode_steps: ClassVar = 250
     body_seen: ClassVar = False
+    draws: ClassVar = 4
     tactile: ClassVar = ("markers", "wrench")
     stands_on: ClassVar = "sensor"
 
-    def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
+    def starts(self, u: Array, tool: Array, body: Array) -> Starts:
+        xp = array_namespace(u)
+        angle, tilt = between(u[:, 0], -math.pi, math.pi), between(u[:, 1], 0.0, math.radians(2.0))
         # The pole leans about an edge of its foot, which stays 0.1 mm above the pad.
-        angle, tilt = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, np.radians(2.0))
-        foot = tool[:3, 3] + [*rng.uniform(-1e-3, 1e-3, 2), 1e-4 + 0.003 * np.sin(tilt)]
-        rotation = rotations(tilt * np.array([np.cos(angle), np.sin(angle), 0.0]))
-        return Start(tool[:3, 3].copy(), {"pole": pose(rotation, foot + 0.15 * rotation[:, 2])})
+        offset = [between(u[:, 2], -1e-3, 1e-3), between(u[:, 3], -1e-3, 1e-3), 1e-4 + 0.003 * xp.sin(tilt)]
+        foot = tool[:3, 3] + xp.stack(offset, axis=1)
+        rotation = rotations(xp.stack([tilt * xp.cos(angle), tilt * xp.sin(angle), xp.zeros_like(tilt)], axis=1))
+        goal = xp.zeros_like(foot) + tool[:3, 3]
+        return Starts(goal, {"pole": pose(rotation, foot + 0.15 * rotation[..., 2])})
 
     def evaluate(self, state: TaskState) -> TaskResult:
-        axis = state.body[:, :3, 2]
-        tilt = np.arccos(np.clip(axis[:, 2], -1.0, 1.0))
+        xp, axis = array_namespace(state.body), state.body[:, :3, 2]
+        tilt = xp.acos(axis[:, 2].clip(-1.0, 1.0))
         foot = state.body[:, :3, 3] - 0.15 * axis
-        terminated = (distances(foot, state.tool[:, :3, 3]) > 0.05) | (state.body[:, 2, 3] < 0.4) | (tilt > np.pi / 6)
+        terminated = (distances(foot, state.tool[:, :3, 3]) > 0.05) | (state.body[:, 2, 3] < 0.4) | (tilt > math.pi / 6)
         terms = {
             "alive": 1.0 * ~terminated,
             "terminated": -2.0 * terminated,
-            "tilt": -np.square(tilt),
-            "tool_speed": -0.01 * np.abs(state.speed).sum(axis=1),
-            "pole_speed": -0.005 * np.abs(state.body_speed[:, 3:]).sum(axis=1),
+            "tilt": -xp.square(tilt),
+            "tool_speed": -0.01 * xp.sum(xp.abs(state.speed), axis=1),
+            "pole_speed": -0.005 * xp.sum(xp.abs(state.body_speed[:, 3:]), axis=1),
         }
-        return TaskResult({**terms, **self.effort(state)}, terminated, ~terminated & (tilt < np.radians(12.0)))
+        return TaskResult({**terms, **self.effort(state)}, terminated, ~terminated & (tilt < math.radians(12.0)))
 
 
 class BalancePoleEnv(TactileEnv):

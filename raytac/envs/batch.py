@@ -12,6 +12,8 @@ import numpy as np
 
 from raytac.checks import check_known, check_numbers, check_whole
 from raytac.envs.action_control import ACTIONS, ActionControl
+from raytac.envs.task_observation import body_from_tool, state_and_goal
+from raytac.envs.task_outcome import task_outcome
 from raytac.envs.task_rules import Task, TaskState
 from raytac.errors import InputError
 from raytac.gel.surface import COARSEST_PITCH, rounded_envs
@@ -25,9 +27,6 @@ from raytac.specs.task_file import load_task
 from raytac.world.environment_models import Variation
 from raytac.world.world import TactileWorld
 from raytac.world.world_state import WorldState
-
-_LENGTH, _SPEED = 0.1, 1.0
-"""Scales of positions [m] and speeds [m/s, rad/s] in observations."""
 
 _PITCH = 0.4e-3
 """Spacing of the gel's nodes where no image needs a finer one [m]."""
@@ -97,7 +96,7 @@ class TaskBatch:
         check_known("action", action, ACTIONS)
         steps = task.max_episode_steps if max_episode_steps is None else max_episode_steps
         self.task, self.num_envs, self.max_episode_steps = task, num_envs, check_whole("max_episode_steps", steps)
-        settings = _settings(task.tactile if isinstance(tactile, str) and tactile == "task" else tactile)
+        settings = task_settings(task.tactile if isinstance(tactile, str) and tactile == "task" else tactile)
         loaded = scene if isinstance(scene, TaskScene) else load_task(task.scene if scene is None else scene)
         self.randomization = Randomization() if randomization is None else randomization
         # Without touch the probe gives the force alone, so that the sensor needs no markers.
@@ -114,7 +113,7 @@ class TaskBatch:
         options: dict[str, Any] = {"outputs": (), "num_envs": num_envs, "seed": seed}
         if settings is not None:
             options = probe.sensor_options()
-        options["pitch"] = _pitch(probe) if pitch is None else pitch
+        options["pitch"] = task_pitch(probe) if pitch is None else pitch
         self.world = TactileWorld(loaded, physics=config, device=device, **options)
         self._variations = VariationSampler(
             loaded, self.world.sensor_names, self.randomization, rigid=rigid, num_envs=num_envs, seed=seed
@@ -196,9 +195,9 @@ class TaskBatch:
     def reset(self, envs: Sequence[int], rngs: Sequence[np.random.Generator]) -> dict[str, np.ndarray]:
         """Begin episodes in environments, each with its own generator; returns the observation (B, …) of all environments."""
         envs = list(envs)
-        starts = [self.task.start(rng, self.start_tool, self.start_body) for rng in rngs]
-        names = {name for start in starts for name in start.bodies}
-        bodies = {name: np.stack([start.bodies[name] for start in starts]) for name in names}
+        u = np.array([rng.random(self.task.draws) for _, rng in zip(envs, rngs, strict=True)]).reshape(len(envs), self.task.draws)
+        starts = self.task.starts(u, self.start_tool, self.start_body)
+        bodies = dict(starts.bodies)
         variation = None if self._variations.is_none else self._variations.draw(envs)
         if variation is not None and self.task.stands_on is not None and self.task.stands_on in variation.mounting:
             # A body that stands on the pad keeps its pose relative to the pad, so it is shifted and tilted with the pad's mounting.
@@ -206,8 +205,7 @@ class TaskBatch:
             shift = nominal @ variation.mounting[self.task.stands_on] @ inverse(nominal)
             bodies[self.task.body] = shift @ bodies[self.task.body]
         state = self.world.reset(envs, bodies=bodies, variation=variation)
-        for b, start in zip(envs, starts, strict=True):
-            self._goal[b] = start.goal
+        self._goal[envs] = starts.goal
         self._steps[envs], self._action[envs], self._begun[envs] = 0, 0.0, True
         self.control.reset(envs)
         for observer in self.observers.values():
@@ -255,6 +253,7 @@ class TaskBatch:
             body_speed=self._body_speed,
             goal=self._goal,
             wrench=wrench,
+            opening=self._opening,
             joint_speed=joint_speed,
             action=actions,
             last_action=last,
@@ -264,16 +263,9 @@ class TaskBatch:
         failed = self.world.failed  # includes failures that only the pad's surface shows
         self.time_s["observation"] += time.perf_counter() - judged
         judged = time.perf_counter()
-        result = self.task.evaluate(task_state)
-        nothing = np.zeros(self.num_envs)
-        terms = {name: nothing + term for name, term in result.terms.items()}
-        if failed.any():
-            terms = {name: np.where(failed, 0.0, term) for name, term in terms.items()}
-        reward = sum(terms.values(), nothing)
-        terminated = result.terminated & ~failed
-        truncated = (failed | (self._steps >= self.max_episode_steps)) & ~terminated
+        end = task_outcome(self.task, task_state, self._steps, self.max_episode_steps, failed)
         self.time_s["reward"] += time.perf_counter() - judged
-        return StepResult(observation, reward, terminated, truncated, terms, result.success & ~failed, failed)
+        return StepResult(observation, end.reward, end.terminated, end.truncated, end.terms, end.success, failed)
 
     # --- observations ----------------------------------------------------------------------------------------------------------
 
@@ -291,15 +283,9 @@ class TaskBatch:
 
         ``state``: present state of the world.
         """
-        tool, body, goal = self._tool, self._body, self._goal
-        position = tool[:, :3, 3]
-        moved, gap = (position - self.start_tool[:3, 3]) / _LENGTH, self._opening / _LENGTH
-        parts = [moved, self._turn, self._speed / _SPEED, gap, self._action]
-        result = {"state": np.concatenate(parts, axis=1), "goal": (goal - position) / _LENGTH}
+        result = state_and_goal(self._tool, self.start_tool, self._turn, self._speed, self._opening, self._action, self._goal)
         if self.body_seen:
-            axes = np.swapaxes(body[:, :3, :2], 1, 2).reshape(-1, 6)
-            result["body"] = np.concatenate([(body[:, :3, 3] - position) / _LENGTH, axes, self._body_speed / _SPEED], axis=1)
-        result = {name: values.astype(np.float32) for name, values in result.items()}
+            result["body"] = body_from_tool(self._tool, self._body, self._body_speed)
         rows = None if which.all() else rounded_envs(np.flatnonzero(which).tolist(), self.num_envs)
         needs_frames = any(observer.settings.needs_frames for observer in self.observers.values())
         frames = self.world.observe(envs=rows) if needs_frames and which.any() else {}
@@ -330,14 +316,14 @@ def _sensor_seed(seed: int, sensor: int) -> int:
     return seed + (sensor << 64)
 
 
-def _pitch(observer: TactileObserver) -> float:
+def task_pitch(observer: TactileObserver) -> float:
     """Pitch [m] as fine as the images, if there are any, between the coarsest allowed one and ``_PITCH``."""
     if "rgb" not in observer.settings.modalities:
         return _PITCH
     return max(COARSEST_PITCH, min(_PITCH, *observer.sensor.camera.pitch_at(observer.layout.rendered)))
 
 
-def _settings(tactile: ObservationSettings | Sequence[str] | str | None) -> ObservationSettings | None:
+def task_settings(tactile: ObservationSettings | Sequence[str] | str | None) -> ObservationSettings | None:
     if tactile is None or isinstance(tactile, ObservationSettings):
         return tactile
     return ObservationSettings((tactile,) if isinstance(tactile, str) else tuple(tactile))

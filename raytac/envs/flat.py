@@ -13,9 +13,7 @@ import numpy as np
 from raytac.checks import check_whole
 from raytac.envs.environments import TactileVectorEnv
 from raytac.envs.processes import serve
-
-_FORCE, _TORQUE = 10.0, 0.1
-"""Scales of the wrench that the critic is given [N, N m]: those of the observation ``wrench``."""
+from raytac.observe.settings import SCALES
 
 
 @dataclass(frozen=True)
@@ -88,9 +86,12 @@ class FlatVector:
         }
         self.layout = FlatLayout(fields, terms, batch.max_episode_steps, batch.control_timestep)
         self.buffers = {name: np.zeros((num_envs, *shape), np.float32) for name, shape in fields.items()}
+        self.reset(seed)
 
     def attach(self, buffers: Mapping[str, np.ndarray]) -> None:
-        """Read and write these arrays from now on."""
+        """Read and write these arrays from now on, which get the present values."""
+        for name, array in buffers.items():
+            array[:] = self.buffers[name]
         self.buffers = dict(buffers)
 
     def reset(self, seed: int | None = None) -> None:
@@ -125,9 +126,9 @@ class FlatVector:
         self._past[:, 0] = now
         self._past[begun] = now[begun, None]
         actor = self._past.reshape(count, -1)
-        wrench = self.env.batch.world.state().wrench
-        scale = np.array([_FORCE] * 3 + [_TORQUE] * 3)
-        felt = [np.nan_to_num(wrench[name] / scale) for name in self._sensors]
+        state = self.env.batch.world.state()
+        failed = state.failed[:, None]
+        felt = [np.where(failed, 0.0, state.wrench[name] / SCALES["wrench"]) for name in self._sensors]
         self.buffers["actor"][:] = actor
         self.buffers["critic"][:] = np.concatenate([actor, observation["body"], *felt], axis=1)
 

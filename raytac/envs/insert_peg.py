@@ -4,13 +4,26 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import numpy as np
+from array_api_compat import array_namespace
 
 from raytac.envs.environments import TactileEnv, TactileVectorEnv
-from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, distances, near
-from raytac.se3 import pose, rotations
+from raytac.envs.task_rules import (
+    Array,
+    Motion,
+    Starts,
+    Task,
+    TaskResult,
+    TaskState,
+    between,
+    constant,
+    distances,
+    moved,
+    near,
+    turned,
+)
+from raytac.se3 import pose
 
-SOCKET = np.array([0.53, 0.0])
+SOCKET = (0.53, 0.0)
 """Centre of the socket's hole in the scene, x and y [m]."""
 RIM = 0.016
 """Height of the socket's upper rim over the table [m]."""
@@ -33,25 +46,26 @@ class InsertPeg(Task):
     )
     max_episode_steps: ClassVar = 250
     body_seen: ClassVar = True
+    draws: ClassVar = 5
 
-    def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
-        position = body[:3, 3] + [*rng.uniform(-0.008, 0.008, 2), 0.0]
-        rotation = rotations(np.array([0.0, 0.0, rng.uniform(-0.1, 0.1)])) @ body[:3, :3]
-        goal = np.array([*(SOCKET + rng.uniform(-1e-3, 1e-3, 2)), 0.0])
-        return Start(goal, {"peg": pose(rotation, position)})
+    def starts(self, u: Array, tool: Array, body: Array) -> Starts:
+        position = moved(body[:3, 3], between(u[:, 0], -0.008, 0.008), between(u[:, 1], -0.008, 0.008))
+        rotation = turned(body[:3, :3], between(u[:, 2], -0.1, 0.1))
+        goal = moved(constant((*SOCKET, 0.0), body), between(u[:, 3], -1e-3, 1e-3), between(u[:, 4], -1e-3, 1e-3))
+        return Starts(goal, {"peg": pose(rotation, position)})
 
     def evaluate(self, state: TaskState) -> TaskResult:
-        peg = state.body[:, :3, 3]
+        xp, peg = array_namespace(state.body), state.body[:, :3, 3]
         tip, grip = (peg + side * _HALF * state.body[:, :3, 2] for side in (-1.0, 0.44))
-        aside, height = distances(tip[:, :2], SOCKET), tip[:, 2]
+        aside, height = distances(tip[:, :2], constant(SOCKET, tip)), tip[:, 2]
         inside = (aside < 2e-3) & (height < RIM)
-        depth = np.where(inside, 1.0 - np.clip(height / RIM, 0.0, 1.0), 0.0)
-        carried = inside | (height > 5e-3)
-        above = distances(tip, np.array([*SOCKET, RIM + 4e-3]))
+        depth = xp.where(inside, 1.0 - (height / RIM).clip(0.0, 1.0), 0.0)
+        carried = inside | ((height > 5e-3) & (state.body[:, 2, 2] > 0.8))
+        above = distances(tip, constant((*SOCKET, RIM + 4e-3), tip))
         terms = {
             "reaching": near(distances(state.tool[:, :3, 3], grip), 0.05),
             "carried": 2.0 * carried,
-            "above": 4.0 * carried * near(np.where(inside, 0.0, above), 0.05),
+            "above": 4.0 * carried * near(xp.where(inside, 0.0, above), 0.05),
             "aligned": 4.0 * carried * near(aside, 3e-3),
             "depth": 10.0 * depth,
         }
@@ -82,7 +96,8 @@ class InsertPegEnv(TactileEnv):
     - `left_markers`, `right_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` selects others (docs/rl.md).
 
     Reward: sum of the terms in `info["reward_terms"]`, all ours; t the middle of the peg's lower end, g the place on its axis 11 mm above
-    its middle, s the socket's axis. Inside: t is below the rim and within 2 mm of s. Carried: t is over 5 mm high, or inside.
+    its middle, s the socket's axis. Inside: t is below the rim and within 2 mm of s. Carried: t is over 5 mm high and
+    the peg stands within 37° of upright, or inside.
 
     | term | value |
     | --- | --- |

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-import numpy as np
+from array_api_compat import array_namespace
 
 from raytac.envs.environments import TactileEnv, TactileVectorEnv
-from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, distances, near
+from raytac.envs.task_rules import Array, Motion, Starts, Task, TaskResult, TaskState, between, constant, distances, moved, near
 from raytac.se3 import pose
 
-HANDLE = np.array([-0.09, 0.0, 0.034])
+HANDLE = (-0.09, 0.0, 0.034)
 """Place at which a gripper holds the handle, drawer frame [m]."""
 
 
@@ -29,15 +29,18 @@ class OpenDrawer(Task):
     )
     max_episode_steps: ClassVar = 200
     body_seen: ClassVar = True
+    draws: ClassVar = 2
 
-    def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
-        position = body[:3, 3] - [rng.uniform(0.0, 0.01), 0.0, 0.0]
-        return Start(body[:3, 3] + HANDLE - [rng.uniform(0.04, 0.09), 0.0, 0.0], {"drawer": pose(body[:3, :3], position)})
+    def starts(self, u: Array, tool: Array, body: Array) -> Starts:
+        xp = array_namespace(u)
+        zero, pulled, goal = xp.zeros_like(u[:, 0]), between(u[:, 0], 0.0, 0.01), between(u[:, 1], 0.04, 0.09)
+        position = moved(body[:3, 3], -pulled, zero)
+        return Starts(moved(body[:3, 3] + constant(HANDLE, body), -goal, zero), {"drawer": pose(body[:3, :3], position)})
 
     def evaluate(self, state: TaskState) -> TaskResult:
-        handle = handle_of(state.body)
-        reach, distance = distances(state.tool[:, :3, 3], handle), np.abs(handle[:, 0] - state.goal[:, 0])
-        pinched = np.minimum(*(-state.wrench[name][:, 2] for name in ("left", "right")))
+        xp, handle = array_namespace(state.body), handle_of(state.body)
+        reach, distance = distances(state.tool[:, :3, 3], handle), xp.abs(handle[:, 0] - state.goal[:, 0])
+        pinched = xp.minimum(*(-state.wrench[name][:, 2] for name in ("left", "right")))
         terms = {
             "reaching": near(reach, 0.05),
             "holding": 1.0 * (pinched > 1.0),
@@ -48,9 +51,9 @@ class OpenDrawer(Task):
         return TaskResult({**terms, **self.effort(state)}, terminated, distance < 5e-3)
 
 
-def handle_of(body: np.ndarray) -> np.ndarray:
+def handle_of(body: Array) -> Array:
     """Place (B, 3) where a gripper holds the handle [m], of drawers with poses (B, 4, 4)."""
-    return body[:, :3, :3] @ HANDLE + body[:, :3, 3]
+    return array_namespace(body).vecdot(body[:, :3, :3], constant(HANDLE, body)) + body[:, :3, 3]
 
 
 class OpenDrawerEnv(TactileEnv):

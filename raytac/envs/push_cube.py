@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
-import numpy as np
-
 from raytac.envs.environments import TactileEnv, TactileVectorEnv
-from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, distances, near
-from raytac.se3 import pose, rotations
+from raytac.envs.task_rules import (
+    Array,
+    Motion,
+    Starts,
+    Task,
+    TaskResult,
+    TaskState,
+    around,
+    between,
+    constant,
+    distances,
+    moved,
+    near,
+    turned,
+)
+from raytac.se3 import pose
 
 
 class PushCube(Task):
@@ -19,17 +32,17 @@ class PushCube(Task):
     motion: ClassVar = Motion(("x", "y", "z"), (3e-3, 3e-3, 1e-3), (0.25, -0.25, 0.035), (0.65, 0.25, 0.10), leash=0.006)
     max_episode_steps: ClassVar = 150
     body_seen: ClassVar = True
+    draws: ClassVar = 5
 
-    def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
-        position = body[:3, 3] + [*rng.uniform(-0.01, 0.01, 2), 0.0]
-        rotation = rotations(np.array([0.0, 0.0, rng.uniform(-0.3, 0.3)])) @ body[:3, :3]
-        angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(0.03, 0.10)
-        goal = position + distance * np.array([np.cos(angle), np.sin(angle), 0.0])
-        return Start(goal, {"cube": pose(rotation, position)})
+    def starts(self, u: Array, tool: Array, body: Array) -> Starts:
+        position = moved(body[:3, 3], between(u[:, 0], -0.01, 0.01), between(u[:, 1], -0.01, 0.01))
+        rotation = turned(body[:3, :3], between(u[:, 2], -0.3, 0.3))
+        goal = around(position, between(u[:, 3], -math.pi, math.pi), between(u[:, 4], 0.03, 0.10))
+        return Starts(goal, {"cube": pose(rotation, position)})
 
     def evaluate(self, state: TaskState) -> TaskResult:
         cube = state.body[:, :3, 3]
-        top = cube + np.array([0.0, 0.0, 0.02])
+        top = cube + constant((0.0, 0.0, 0.02), cube)
         reach, distance = distances(state.tool[:, :3, 3], top), distances(cube[:, :2], state.goal[:, :2])
         force = -state.wrench["sensor"][:, 2]
         terms = {

@@ -19,7 +19,7 @@ _MODULES: Final = {
     "InsertPeg": "insert_peg",
     "OpenDrawer": "open_drawer",
 }
-_VERSIONS: Final = {"PushCube": 0, "BalancePole": 1, "LiftCube": 1, "RollBall": 1, "InsertPeg": 0, "OpenDrawer": 0}
+_VERSIONS: Final = {"PushCube": 0, "BalancePole": 1, "LiftCube": 2, "RollBall": 1, "InsertPeg": 0, "OpenDrawer": 0}
 """A task has one version, which its docstring tells the history of; Gymnasium names it to who asks for an older one."""
 _NAMES: Final = {name: f"raytac/{name}-v{version}" for name, version in _VERSIONS.items()}
 IDS: Final = tuple(_NAMES.values())

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
-import numpy as np
+from array_api_compat import array_namespace
 
 from raytac.envs.environments import TactileEnv, TactileVectorEnv
-from raytac.envs.task_rules import Motion, Start, Task, TaskResult, TaskState, distances, near
+from raytac.envs.task_rules import Array, Motion, Starts, Task, TaskResult, TaskState, around, between, distances, moved, near
 from raytac.se3 import pose
 
 
@@ -19,29 +20,29 @@ class RollBall(Task):
     motion: ClassVar = Motion(("x", "y", "z"), (2e-3, 2e-3, 1e-3), (0.40, -0.05, 0.007), (0.50, 0.05, 0.02), leash=0.004)
     max_episode_steps: ClassVar = 150
     body_seen: ClassVar = False
+    draws: ClassVar = 4
 
-    def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
-        position = body[:3, 3] + [*rng.uniform(-2e-3, 2e-3, 2), 0.0]
-        angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(5e-3, 10e-3)
-        goal = position + distance * np.array([np.cos(angle), np.sin(angle), 0.0])
-        return Start(goal, {"ball": pose(body[:3, :3], position)})
+    def starts(self, u: Array, tool: Array, body: Array) -> Starts:
+        position = moved(body[:3, 3], between(u[:, 0], -2e-3, 2e-3), between(u[:, 1], -2e-3, 2e-3))
+        goal = around(position, between(u[:, 2], -math.pi, math.pi), between(u[:, 3], 5e-3, 10e-3))
+        return Starts(goal, {"ball": pose(body[:3, :3], position)})
 
     def evaluate(self, state: TaskState) -> TaskResult:
-        ball, pad = state.body[:, :3, 3], state.tool[:, :3, 3]
+        xp, ball, pad = array_namespace(state.body), state.body[:, :3, 3], state.tool[:, :3, 3]
         aside, distance = distances(ball[:, :2], pad[:, :2]), distances(ball[:, :2], state.goal[:, :2])
         force = -state.wrench["sensor"][:, 2]
         touching = (force > 0.05) & (force < 5.0)
         terms = {
             "touching": 0.25 * touching,
-            "aside": -0.05 * np.square(100.0 * aside),
+            "aside": -0.05 * xp.square(100.0 * aside),
             "lost_height": -15.0 * (ball[:, 2] > 0.025),
             "goal_wide": 0.75 * near(distance, 0.6),
             "goal": 1.25 * near(distance, 0.2),
-            "goal_narrow": 1.75 * (1.0 - np.square(np.tanh(distance / 0.08))),
+            "goal_narrow": 1.75 * (1.0 - xp.square(xp.tanh(distance / 0.08))),
             "goal_fine": 4.0 * near(distance, 0.005),
             "reached": 5.0 * ((distance < 0.002) & touching),
         }
-        off = (np.abs(ball[:, 0] - 0.5) > 0.3) | (np.abs(ball[:, 1]) > 0.4) | (distance > 0.75)
+        off = (xp.abs(ball[:, 0] - 0.5) > 0.3) | (xp.abs(ball[:, 1]) > 0.4) | (distance > 0.75)
         terminated = off | (aside > 0.015) | (pad[:, 2] < 0.002)
         return TaskResult({**terms, **self.effort(state)}, terminated, distance < 0.002)
 

@@ -18,6 +18,7 @@ from raytac.envs.environments import TactileVectorEnv
 from raytac.envs.flat import FlatLayout, FlatVector, serve_flat, shared_arrays
 from raytac.envs.processes import Workers
 from raytac.errors import InputError
+from raytac.observe.settings import SCALES
 
 
 class RslVecEnv(VecEnv):
@@ -68,6 +69,7 @@ class RslVecEnv(VecEnv):
             self._vector = FlatVector(kind, num_envs, seed=seed, **options)
             self.layout, self._arrays = self._vector.layout, self._vector.buffers
         self.num_actions, self.max_episode_length = self.layout.fields["action"][0], self.layout.max_episode_steps
+        self.control_timestep = self.layout.control_timestep
         self.cfg = {"kind": kind.__name__, **{name: str(value) for name, value in options.items()}}
 
     @property
@@ -136,3 +138,92 @@ class RslVecEnv(VecEnv):
         assert self._workers is not None
         self._workers.send(command, values)
         self._workers.replies()
+
+
+class RslWarpEnv(VecEnv):
+    """Environments of one task on MuJoCo Warp, with the observation groups of ``RslVecEnv``; nothing is copied to the host.
+
+    ``extras`` are those of ``RslVecEnv``, with tensors in ``log``.
+    """
+
+    def __init__(
+        self,
+        kind: type[TactileVectorEnv],
+        *,
+        num_envs: int,
+        device: str = "auto",
+        history: int = 1,
+        reward_scale: float = 1.0,
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
+        """Make the environments; ``reset`` begins the episodes.
+
+        Args:
+            kind: the task's vector, such as ``PushCubeVectorEnv``.
+            num_envs, device, seed: as of ``WarpBatch``.
+            history: number of steps whose observations the actor is given.
+            reward_scale: factor of the reward.
+            options: of ``WarpBatch``; ``body_seen`` is whether the actor sees the body.
+
+        Raises ``InputError`` as ``WarpBatch``.
+        """
+        from raytac.envs.warp_batch import WarpBatch  # MuJoCo Warp is an extra of its own
+
+        self.batch = WarpBatch(kind.task(), num_envs=num_envs, device=device, seed=seed, **options)
+        self.num_envs, self.device, self.reward_scale = num_envs, str(self.batch.device), reward_scale
+        self._history, self._past = check_whole("history", history), torch.zeros(0)
+        self.num_actions, self.max_episode_length = self.batch.size, self.batch.max_episode_steps
+        self.control_timestep = self.batch.control_timestep
+        self._scale = torch.tensor(SCALES["wrench"], dtype=torch.float64, device=self.device)
+        self._observed = TensorDict({}, batch_size=[num_envs])
+        self.cfg = {"kind": kind.__name__, **{name: str(value) for name, value in options.items()}}
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:  # type: ignore[override]
+        """Steps (B,) since the start of each episode. Setting them ends the episodes as much earlier."""
+        return self.batch.steps.clone()
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps: torch.Tensor) -> None:
+        self.batch.steps.copy_(steps)
+
+    def reset(self, seed: int | None = None) -> TensorDict:
+        """Begin all episodes; None goes on with the present random stream."""
+        observation = self.batch.reset(seed)
+        begun = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        self._observe(observation, begun)
+        return self.get_observations()
+
+    def get_observations(self) -> TensorDict:
+        """Observations after the last step or reset."""
+        return self._observed
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
+        """Step all environments with actions (B, k), cut to [−1, 1]; those that end begin again."""
+        result = self.batch.step(actions)
+        done = result.terminated | result.truncated
+        self._observe(result.observation, done)
+        extras = {
+            "time_outs": (result.truncated & ~result.failed).float(),
+            "success": result.success.float(),
+            "failed": result.failed.float(),
+            "log": {f"/reward/{name}": term.mean() for name, term in result.terms.items()},
+        }
+        return self.get_observations(), self.reward_scale * result.reward.float(), done.float(), extras
+
+    def close(self) -> None:
+        """Wait for the device. Raises ``InputError`` if contacts were lost for want of memory."""
+        self.batch.check()
+
+    def _observe(self, observation: dict[str, torch.Tensor], begun: torch.Tensor) -> None:
+        """Make both observations; the history of environments that have ``begun`` holds their first one alone."""
+        now = torch.cat([values.reshape(self.num_envs, -1).float() for values in observation.values()], dim=1)
+        if not self._past.numel():
+            self._past = now[:, None].repeat(1, self._history, 1)
+        self._past = torch.cat([now[:, None], self._past[:, :-1]], dim=1)
+        self._past = torch.where(begun[:, None, None], now[:, None], self._past)
+        actor = self._past.reshape(self.num_envs, -1)
+        felt = [(wrench / self._scale).float() for wrench in self.batch.wrench.values()]
+        critic = torch.cat([actor, self.batch.body_observation, *felt], dim=1)
+        self._observed = TensorDict({"actor": actor, "critic": critic}, batch_size=[self.num_envs])

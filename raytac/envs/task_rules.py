@@ -1,13 +1,23 @@
-"""Rules of a task: motion of the tool, start, reward and end of an episode. Batches, SI units, world frame."""
+"""Rules of a task: motion of the tool, start, reward and end of an episode. Batches, SI units, world frame.
+
+Arrays are NumPy's, or PyTorch's on any device: rules are written once, by the functions that both have (array API standard). They copy
+nothing between host and device and never wait, so that a step can be recorded as a CUDA graph. (Hence the arrays' method ``clip``: the
+function of array-api-compat 1.11 and 1.12 waits for the device.)
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
-import numpy as np
+from array_api_compat import array_namespace, device
+
+from raytac.se3 import rotations
+
+Array = Any
+"""Array of NumPy or PyTorch."""
 
 
 @dataclass(frozen=True)
@@ -38,36 +48,38 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Start:
-    """Start of one episode."""
+class Starts:
+    """Starts of n episodes."""
 
-    goal: np.ndarray
-    """Goal position (3,) [m]."""
-    bodies: dict[str, np.ndarray] = field(default_factory=dict)
-    """``world_from_body`` (4, 4) of bodies that do not start as in the scene."""
+    goal: Array
+    """Goal positions (n, 3) [m]."""
+    bodies: dict[str, Array] = field(default_factory=dict)
+    """``world_from_body`` (n, 4, 4) of bodies that do not start as in the scene."""
 
 
 @dataclass(frozen=True)
 class TaskState:
     """B environments after a step."""
 
-    tool: np.ndarray
+    tool: Array
     """Pose (B, 4, 4)."""
-    speed: np.ndarray
+    speed: Array
     """Mean velocity of the tool over the last step [m/s], (B, 3)."""
-    body: np.ndarray
+    body: Array
     """Pose (B, 4, 4) of the task's body."""
-    body_speed: np.ndarray
+    body_speed: Array
     """Mean velocity [m/s] and angular velocity [rad/s] of the body over the last step, (B, 6)."""
-    goal: np.ndarray
+    goal: Array
     """Goal positions (B, 3) [m]."""
-    wrench: Mapping[str, np.ndarray]
+    wrench: Mapping[str, Array]
     """Wrench (B, 6) of every sensor, pad frame."""
-    joint_speed: np.ndarray
+    opening: Array
+    """Gap between two pads (B, 1) [m]; (B, 0) without a gripper."""
+    joint_speed: Array
     """Joint speeds (B, n) [rad/s]."""
-    action: np.ndarray
+    action: Array
     """Action of this step (B, k)."""
-    last_action: np.ndarray
+    last_action: Array
     """Action of the step before (B, k)."""
 
 
@@ -75,11 +87,11 @@ class TaskState:
 class TaskResult:
     """Reward and end of a step, in B environments."""
 
-    terms: dict[str, np.ndarray]
+    terms: dict[str, Array]
     """Terms of the reward, each (B,); their sum is the reward."""
-    terminated: np.ndarray
+    terminated: Array
     """Episodes that end here, (B,), bool."""
-    success: np.ndarray
+    success: Array
     """Environments in which the task is done now, (B,), bool; this ends no episode."""
 
 
@@ -94,6 +106,8 @@ class Task(ABC):
     max_episode_steps: ClassVar[int]
     body_seen: ClassVar[bool]
     """Default of ``TaskBatch``'s ``body_seen``: the body's pose and velocity are observed."""
+    draws: ClassVar[int]
+    """Number of random numbers that a start needs."""
     tactile: ClassVar[tuple[str, ...]] = ("markers",)
     """Default modalities of every sensor."""
 
@@ -101,28 +115,66 @@ class Task(ABC):
     """Sensor whose pad carries the body at the start; None: something else does."""
 
     @abstractmethod
-    def start(self, rng: np.random.Generator, tool: np.ndarray, body: np.ndarray) -> Start:
-        """Draw an episode, given poses (4, 4) of tool and body in the scene."""
+    def starts(self, u: Array, tool: Array, body: Array) -> Starts:
+        """Starts of n episodes from uniform random numbers ``u`` (n, ``draws``) in [0, 1), and poses (4, 4) in the scene."""
 
     @abstractmethod
     def evaluate(self, state: TaskState) -> TaskResult:
         """Reward and end of a step."""
 
     @staticmethod
-    def effort(state: TaskState) -> dict[str, np.ndarray]:
+    def effort(state: TaskState) -> dict[str, Array]:
         """Terms of every task: −1e-4 |a − a₋₁|² and −1e-4 |q̇|² (Isaac Lab's lift task, its weights at the start)."""
         return {
-            "action_rate": -1e-4 * np.square(state.action - state.last_action).sum(axis=1),
-            "joint_speed": -1e-4 * np.square(state.joint_speed).sum(axis=1),
+            "action_rate": -1e-4 * squared(state.action - state.last_action),
+            "joint_speed": -1e-4 * squared(state.joint_speed),
         }
 
 
-def distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Distances (B,) of points (B, d)."""
-    apart = a - b
-    return np.sqrt(np.vecdot(apart, apart))
+def distances(a: Array, b: Array) -> Array:
+    """Distances (B,) of points (B, d), or from one point (d,)."""
+    xp, apart = array_namespace(a), a - b
+    return xp.sqrt(xp.vecdot(apart, apart))
 
 
-def near(distance: np.ndarray, width: float) -> np.ndarray:
+def squared(vectors: Array) -> Array:
+    """Squared lengths (B,) of vectors (B, d)."""
+    xp = array_namespace(vectors)
+    return xp.sum(xp.square(vectors), axis=1)
+
+
+def near(distance: Array, width: float) -> Array:
     """1 − tanh(d / width): 1 at no distance, 0 far away."""
-    return 1.0 - np.tanh(distance / width)
+    return 1.0 - array_namespace(distance).tanh(distance / width)
+
+
+def constant(values: Sequence[float], like: Array) -> Array:
+    """A vector of the type and on the device of another array, where it is made: nothing is copied from the host."""
+    result = array_namespace(like).empty((len(values),), dtype=like.dtype, device=device(like))
+    for k, value in enumerate(values):
+        result[k : k + 1] = value  # a slice is filled on the device, a single element would be copied there
+    return result
+
+
+def between(u: Array, low: float, high: float) -> Array:
+    """Numbers spread evenly over an interval, from those in [0, 1), as ``numpy.random.Generator.uniform`` makes them."""
+    return low + (high - low) * u
+
+
+def moved(point: Array, x: Array, y: Array) -> Array:
+    """Points (n, 3): one point (3,), or points (n, 3), moved horizontally by x and y, each (n,)."""
+    xp = array_namespace(x)
+    return point + xp.stack([x, y, xp.zeros_like(x)], axis=1)
+
+
+def around(points: Array, angle: Array, distance: Array) -> Array:
+    """Points (n, 3) at a distance from points (n, 3), in the horizontal direction of an angle [rad], each (n,)."""
+    xp = array_namespace(points)
+    return moved(points, distance * xp.cos(angle), distance * xp.sin(angle))
+
+
+def turned(rotation: Array, angle: Array) -> Array:
+    """Rotations (n, 3, 3): one rotation (3, 3) turned about the world's z axis by angles (n,) [rad]."""
+    xp = array_namespace(angle)
+    zero = xp.zeros_like(angle)
+    return rotations(xp.stack([zero, zero, angle], axis=1)) @ rotation

@@ -21,12 +21,21 @@ def find_edges(mask: np.ndarray) -> np.ndarray:
     return np.flatnonzero(padded[1:] != padded[:-1])
 
 
-def join_runs(row: list[int], start: list[int], stop: list[int], ny: int) -> list[int]:
-    """Number of the first run of the 8-connected piece of every run of ``find_runs``.
+def join_runs(row: np.ndarray, start: np.ndarray, stop: np.ndarray, ny: int) -> np.ndarray:
+    """Number of the first run of the 8-connected piece of every run of ``find_runs``, (R,).
 
     Union-find (Rosenfeld and Pfaltz 1966): a run is joined to those of the row above, in the same mask of ``ny`` rows, that it touches
     at a side or a corner.
     """
+    if (row[1:] > row[:-1]).all():  # one run a row, as of most contacts: the run before is the only one that may touch
+        begins = np.ones(len(row), bool)
+        begins[1:] = (row[1:] > row[:-1] + 1) | (row[1:] % ny == 0) | (start[1:] > stop[:-1]) | (start[:-1] > stop[1:])
+        return np.flatnonzero(begins)[np.cumsum(begins) - 1]
+    return np.array(_joined(row.tolist(), start.tolist(), stop.tolist(), ny))
+
+
+def _joined(row: list[int], start: list[int], stop: list[int], ny: int) -> list[int]:
+    """``join_runs`` of any runs."""
     parent = list(range(len(row)))
     above = 0
     for i, r in enumerate(row):

@@ -21,9 +21,9 @@ FINAL_SIGMA = 1.1 * _TAXIM_PIXEL
 CONTACT_RULES = ("unilateral", "threshold")
 CONTACT_SCALE = 0.4
 """Share of the deepest overlap from which a node counts as in full contact."""
-_FINEST = 0.2
+FINEST = 0.2
 """Gaussians narrower than this share of the pitch are skipped: the grid cannot resolve their effect."""
-_ROUNDING = 1e-5
+ROUNDING = 1e-5
 """Excess of w over u in contact, as a share of the deepest overlap: above the pyramid's rounding in float32, far below any shape."""
 _REACH = 4.8
 """Standard deviations of all Gaussians together beyond which a contact has no effect: Φ(−4.8) is 10⁻⁶ of its depth."""
@@ -71,7 +71,7 @@ class ElasticSurround:
         if contact_rule not in CONTACT_RULES:
             raise InputError("contact_rule", value=contact_rule, rule="must be a known rule", choices=CONTACT_RULES)
         self.grid, self.contact_rule, self.contact_scale = grid, contact_rule, contact_scale
-        finest = _FINEST * min(grid.pitch)
+        finest = FINEST * min(grid.pitch)
         self._pyramid = [GaussianBlur(grid.shape, grid.pitch, s) for s in sigmas if s > finest]
         self._final = GaussianBlur(grid.shape, grid.pitch, final_sigma) if final_sigma > finest else None
         kept = [blur.sigma for blur in (*self._pyramid, *([] if self._final is None else [self._final]))]
@@ -203,7 +203,7 @@ def _slack(deepest: np.ndarray | np.float32) -> np.ndarray:
     Where the overlap is constant the Gaussians keep it up to rounding, which must not decide the contact. The deepest node is always in
     contact, since no Gaussian exceeds the maximum.
     """
-    return np.maximum(np.float32(_ROUNDING) * deepest, np.finfo(np.float32).tiny)
+    return np.maximum(np.float32(ROUNDING) * deepest, np.finfo(np.float32).tiny)
 
 
 def _touched(overlap: np.ndarray) -> Piece:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
-from operator import add
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -112,13 +111,17 @@ class ContactCells:
             indentation = np.where(touched, indentation, np.float32(0))
         np.multiply(indentation, touched, out=indentation)
         cells = np.s_[:, r0:r1, c0:c1]
-        depth[cells] = self._pooled(np.add, indentation, r1 - r0, c1 - c0) / np.float32(kx * ky)
+        depth[cells] = self._pooled(np.add, indentation, r1 - r0, c1 - c0)
+        if kx * ky > 1:
+            depth[cells] /= np.float32(kx * ky)
         contact[cells] = self._pooled(np.logical_or, touched, r1 - r0, c1 - c0)
         return ContactSamples(self, depth, contact, (r0, r1, c0, c1))
 
     def _pooled(self, join: np.ufunc, values: np.ndarray, ny: int, nx: int) -> np.ndarray:
         """Values (B, Ny, Nx) of nodes joined over ``ny`` × ``nx`` whole cells, of which the last may reach beyond the pad."""
         kx, ky = self.nodes
+        if kx == ky == 1:
+            return values
         missing = ny * ky - values.shape[1], nx * kx - values.shape[2]
         if any(missing):
             values = np.pad(values, ((0, 0), (0, missing[0]), (0, missing[1])))
@@ -372,22 +375,21 @@ def _detect(samples: ContactSamples) -> list[list[_Contact]]:
     weights = np.zeros((2, len(contacts) * ny, nx + 1))
     np.maximum(samples.depth[:, r0:r1, c0:c1].reshape(-1, nx), 1e-9, out=weights[0, :, :nx])
     np.multiply(weights[0, :, :nx], cells.x[c0:c1], out=weights[1, :, :nx])
-    total, along = np.add.reduceat(weights.reshape(2, -1), edges, axis=1)[:, ::2].tolist()
-    rows, columns = (part.tolist() for part in np.divmod(edges, nx + 1))
-    rows, starts, stops, y = rows[::2], columns[::2], columns[1::2], cells.y[r0:r1].tolist()
+    total, along = np.add.reduceat(weights.reshape(2, -1), edges, axis=1)[:, ::2]
+    row, column = np.divmod(edges, nx + 1)
+    row, start, stop = row[::2], column[::2], column[1::2]
+    number = join_runs(row, start, stop, ny)
     # Second moments are taken about the box's corner in cells: of whole numbers, nothing cancels.
-    pieces: dict[int, list[float]] = {}
-    for number, row, start, stop, w, wx in zip(
-        join_runs(rows, starts, stops, ny), rows, starts, stops, total, along, strict=True
-    ):
-        line, length, middle = row % ny, stop - start, 0.5 * (start + stop)
-        first = length, length * middle, length * line
-        second = length * (middle * middle + length * length / 12.0), length * middle * line, length * line * line
-        run = w, wx, w * y[line], *first, *second
-        piece = pieces.get(number)
-        pieces[number] = list(run) if piece is None else list(map(add, piece, run))
+    line, length, y = row % ny, (stop - start).astype(float), cells.y[r0:r1]
+    middle = 0.5 * (start + stop)
+    mx, my = length * middle, length * line
+    mxx = middle * mx + length * length * length / 12.0
+    runs = np.stack([total, along, total * y[line], length, mx, my, mxx, mx * line, my * line])
+    order = np.argsort(number, kind="stable")
+    roots = np.flatnonzero(number == np.arange(len(number)))
+    sums = np.add.reduceat(runs[:, order], np.searchsorted(number[order], roots), axis=1)
     dx, dy = cells.pitch
-    for number, (w, wx, wy, count, mx, my, mxx, mxy, myy) in pieces.items():
+    for env, (w, wx, wy, count, mx, my, mxx, mxy, myy) in zip((row[roots] // ny).tolist(), sums.T.tolist(), strict=True):
         area = count * dx * dy / math.pi
         mx, my = mx / count, my / count
         xx, xy, yy = mxx / count - mx * mx, mxy / count - mx * my, myy / count - my * my + 1.0 / 12.0
@@ -396,5 +398,5 @@ def _detect(samples: ContactSamples) -> list[list[_Contact]]:
         at, depth = (wx / w, wy / w), w / count
         z = cells.rest_at(*at) - depth
         one = _Contact(*at, 0.0, 0.0, 0.0, scale * xx, scale * xy, scale * yy, depth, math.sqrt(area), z)
-        contacts[rows[number] // ny].append(one)
+        contacts[env].append(one)
     return contacts

@@ -24,7 +24,7 @@ Man Cybern. 16(1), 1986; the second term moves a redundant arm towards q₀ with
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -202,6 +202,10 @@ class DifferentialIk:
         return solution.x[self.arm.dof]
 
 
+SERVO_READS = ("joints", "anchor", "axis", "site")
+"""Numbers of an arm (``Arm.numbers``) that ``PoseServo`` reads."""
+
+
 class PoseServo:
     """Steps of one arm in any number of environments. It has no state."""
 
@@ -255,31 +259,22 @@ class PoseServo:
         """
         # Where their numbers lie is looked up once for states that are asked about again and again.
         if self._latest is None or not self._latest.reader.reads(datas):
-            self._latest = _ServoBatch(self.arm, datas, self._speed, self._posture, self._gain, self._damping)
+            self._latest = _ServoBatch(self, datas)
         return self._latest.targets(world_from_target, twist, duration)
 
+    def struct(self, arrays: Mapping[str, wp.array]) -> Any:
+        """Arguments of the kernel ``servo_step`` for B states, on the device of ``arrays``: the numbers ``SERVO_READS`` of the arm."""
+        joints, n = arrays["joints"], len(self.arm)
+        servo: Any = Servo()
+        servo.joints, servo.anchor, servo.axis, servo.site = (arrays[name] for name in SERVO_READS)
 
-class _ServoBatch:
-    """Arrays of ``PoseServo`` for B states, and its kernel."""
+        def numbers(values: np.ndarray) -> wp.array:
+            return wp.array(values, dtype=wp.float64, device=joints.device)
 
-    def __init__(
-        self,
-        arm: Arm,
-        datas: Sequence[mujoco.MjData],
-        fastest: np.ndarray,
-        posture: np.ndarray | None,
-        gain: float,
-        damping: float,
-    ) -> None:
-        count, n = len(datas), len(arm)
-        names = "joints", "anchor", "axis", "site"
-        self.reader = StateReader(datas, {name: one for name, one in arm.numbers().items() if name in names})
-        servo = Servo()
-        servo.joints, servo.anchor, servo.axis, servo.site = (self.reader.arrays[name] for name in names)
-        servo.slides = wp.array(arm.slides, dtype=wp.int32, device="cpu")
-        servo.range, servo.fastest = _numbers(arm.range), _numbers(fastest)
-        servo.posture = _numbers(np.zeros(n) if posture is None else posture)
-        servo.gain, servo.damping = 0.0 if posture is None else gain, damping
+        servo.slides = wp.array(self.arm.slides, dtype=wp.int32, device=joints.device)
+        servo.range, servo.fastest = numbers(self.arm.range), numbers(self._speed)
+        servo.posture = numbers(np.zeros(n) if self._posture is None else self._posture)
+        servo.gain, servo.damping = 0.0 if self._posture is None else self._gain, self._damping
         work = {
             "target": (4, 4),
             "twist": (6,),
@@ -290,21 +285,27 @@ class _ServoBatch:
             "velocity": (n,),
         }
         for name, size in work.items():
-            setattr(servo, name, _numbers(np.zeros((count, *size))))
-        servo.duration = _numbers(np.zeros(1))
-        self._target, self._twist, self._duration = servo.target.numpy(), servo.twist.numpy(), servo.duration.numpy()
-        self._results = servo.step.numpy(), servo.velocity.numpy()
-        self._step = Recorded(self.reader.launch, partial(wp.launch, servo_step, dim=count, inputs=[servo], device="cpu"))
+            setattr(servo, name, wp.zeros((len(joints), *size), dtype=wp.float64, device=joints.device))
+        servo.duration = wp.zeros(1, dtype=wp.float64, device=joints.device)
+        return servo
+
+
+class _ServoBatch:
+    """Arrays of ``PoseServo`` for B states of C MuJoCo, and its kernel."""
+
+    def __init__(self, servo: PoseServo, datas: Sequence[mujoco.MjData]) -> None:
+        members = {name: one for name, one in servo.arm.numbers().items() if name in SERVO_READS}
+        self.reader = StateReader(datas, members)
+        struct = servo.struct(self.reader.arrays)
+        self._target, self._twist, self._duration = struct.target.numpy(), struct.twist.numpy(), struct.duration.numpy()
+        self._results = struct.step.numpy(), struct.velocity.numpy()
+        self._step = Recorded(self.reader.launch, partial(wp.launch, servo_step, dim=len(datas), inputs=[struct], device="cpu"))
 
     def targets(self, world_from_target: np.ndarray, twist: np.ndarray, duration: float) -> tuple[np.ndarray, np.ndarray]:
         self._target[:], self._twist[:], self._duration[:] = world_from_target, twist, duration
         self._step()
         step, velocity = self._results
         return step.copy(), velocity.copy()
-
-
-def _numbers(values: np.ndarray) -> Any:
-    return wp.array(values, dtype=wp.float64, device="cpu")
 
 
 def _mink() -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -12,24 +13,33 @@ from raytac.warp_runtime import Recorded, start_warp
 
 
 class PoseErrors:
-    """``se3.pose_error`` of ``pairs`` times B poses, B fixed."""
+    """``se3.pose_error`` of ``pairs`` times B poses, B fixed, of NumPy arrays or of PyTorch tensors on a device."""
 
-    def __init__(self, count: int, pairs: int = 1) -> None:
-        """Arrays of ``count`` B poses, ``pairs`` times."""
+    def __init__(self, count: int, pairs: int = 1, device: str | None = None) -> None:
+        """Arrays of ``count`` B poses, ``pairs`` times.
+
+        Args:
+            count: number of poses B.
+            pairs: number of pairs in a call.
+            device: None takes NumPy arrays. With a device, such as "cuda:0" or "cpu", poses and results are PyTorch tensors on it, and a
+                call copies nothing to the host; its kernel runs in Warp's present stream.
+        """
         start_warp()
-        size = count * pairs
-        a, b = (wp.zeros((size, 4, 4), dtype=wp.float64, device="cpu") for _ in range(2))
-        error = wp.zeros((size, 6), dtype=wp.float64, device="cpu")
-        self._a, self._b = (array.numpy().reshape(pairs, count, 4, 4) for array in (a, b))
-        self._error = error.numpy().reshape(pairs, count, 6)
-        self._launch = Recorded(partial(wp.launch, pose_errors, dim=size, inputs=[a, b], outputs=[error], device="cpu"))
+        size, place = count * pairs, device or "cpu"
+        a, b = (wp.zeros((size, 4, 4), dtype=wp.float64, device=place) for _ in range(2))
+        error = wp.zeros((size, 6), dtype=wp.float64, device=place)
+        view = wp.array.numpy if device is None else wp.to_torch
+        self._a, self._b = (view(array).reshape(pairs, count, 4, 4) for array in (a, b))
+        self._error = view(error).reshape(pairs, count, 6)
+        launch = partial(wp.launch, pose_errors, dim=size, inputs=[a, b], outputs=[error], device=place)
+        self._launch = Recorded(launch) if device is None else launch
 
-    def __call__(self, *pairs: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    def __call__(self, *pairs: tuple[Any, Any]) -> Any:
         """Displacements (pairs, B, 6) from the second pose of each pair to the first, world axes.
 
-        Poses (B, 4, 4), or (4, 4) of one for all.
+        Poses (B, 4, 4), or (4, 4) of one for all. The results are float64.
         """
         for k, (a, b) in enumerate(pairs):
             self._a[k], self._b[k] = a, b
         self._launch()
-        return self._error.copy()
+        return self._error.copy() if isinstance(self._error, np.ndarray) else self._error.clone()

@@ -20,6 +20,8 @@ class ImplicitDamping:
 
     Attributes:
         matters: whether there is damping that a step of the model's timestep does not resolve. If not, steps are MuJoCo's own.
+        share: of a joint's acceleration, in which MuJoCo's forces give it at rest, that comes within a step of the model's timestep:
+            M / (M + Δt D) on the diagonal, (nv,); 1 where damping does not matter.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -34,7 +36,9 @@ class ImplicitDamping:
         mujoco.mj_forward(model, start)
         mass = start.M[self._diagonal].copy()
         damping = self._damping(model, start)[self._diagonal]
-        self.matters = bool((model.opt.timestep * damping > _MATTERS * mass).any())
+        step = model.opt.timestep
+        self.matters = bool((step * damping > _MATTERS * mass).any())
+        self.share = mass / (mass + step * damping) if self.matters else np.ones(model.nv)
 
     def clear(self) -> None:
         """Forget environments that were not stepped."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
 
 from raytac.physics.rigid.gel_contact import Bodies, GelContact
@@ -81,3 +82,13 @@ def gel_contact(
         case_travel=_CASE_TRAVEL,
         device=device,
     )
+
+
+def last_dofs(model: mujoco.MjModel, bodies: np.ndarray) -> np.ndarray:
+    """Last degree of freedom that moves each of the bodies (n,); −1 of one that stands still."""
+    result = []
+    for body in bodies.tolist():
+        while body and not model.body_dofnum[body]:
+            body = int(model.body_parentid[body])
+        result.append(int(model.body_dofadr[body] + model.body_dofnum[body]) - 1 if body else -1)
+    return np.array(result, int)

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from raytac.errors import OverlapError
+from raytac.errors import InputError, OverlapError
 from raytac.gel.surface import PadGrid
 from raytac.physics.base import PadReading
 from raytac.physics.rigid.gel_contact import GelContact, HostViews
@@ -62,7 +62,14 @@ class RigidPads:
     meshes: tuple[str, ...] = ()
 
     def __init__(self, composed: WorldModel, contact: GelContact, pairs: GelPairs, engine: Engine) -> None:
-        """Pads of ``composed``; ``contact``: of their gels, on which ``engine`` acts; ``pairs``: of gels that may touch."""
+        """Pads of ``composed``; ``contact``: of their gels, on which ``engine`` acts; ``pairs``: of gels that may touch.
+
+        Raises ``InputError`` for an engine that does not divide steps.
+        """
+        if not engine.divides:
+            raise InputError(
+                "engine", value=type(engine).__name__, rule="must divide steps: others have the order of a step themselves"
+            )
         self.composed, self.contact, self.engine, self._pairs = composed, contact, engine, pairs
         self.bodies = composed.touched
         self._names = [mounted.name for mounted in composed.sensors]

@@ -1,8 +1,8 @@
-"""``WarpWorld``: a task scene with rigid pads on MuJoCo Warp, thousands of environments on one GPU, driven by joint targets."""
+"""``WarpWorld``: a task scene with rigid pads on MuJoCo Warp, thousands of environments on one GPU, driven by its arm's joints or tool."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,11 @@ import warp as wp
 from raytac.checks import MOST_ENVIRONMENTS, check_number, check_numbers, check_whole
 from raytac.device import resolve_device
 from raytac.errors import InputError
-from raytac.robots.arm_kernels import Springs, joint_springs
+from raytac.robots.arm_kernels import Springs, joint_springs, servo_step
+from raytac.robots.ik import PoseServo
+from raytac.robots.panda import MAX_VELOCITY
+from raytac.robots.states import body_pose, numbers, site_pose
+from raytac.se3 import rigid_poses
 from raytac.specs.task import TaskScene
 from raytac.specs.task_file import load_task
 from raytac.world.compose import compose
@@ -20,22 +24,25 @@ from raytac.world.engine.mjwarp import MujocoWarp
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.gel_pairs import GelPairs
 from raytac.world.pad_contact import PadIndices, gel_contact
+from raytac.world.start_kernels import aim_at_positions, place_body, set_columns
 
-_READ = ("time", "joints", "speed", "bias", "mass")
+_SPRINGS = ("joints", "speed", "bias", "mass")
 
 
 class WarpWorld:
-    """B environments of a task scene, whose arms follow joint targets by springs of the law of ``JointImpedance``.
+    """B environments of a task scene, whose arms follow targets by springs in their joints, of the law of ``JointImpedance``.
 
-    A control step is launched without waiting for the device, on CUDA as one graph. Sensors, and controllers of another kind, need
-    ``TactileWorld``. An environment in which a body goes through a pad is no longer active.
+    A control step is launched without waiting for the device, on CUDA as one graph. An environment in which physics breaks down, or a body
+    goes through a pad, is no longer active until it is reset.
 
     Attributes:
         composed: names and indices of the scene's parts in the model.
-        contact: of the gels; ``contact.wrenches`` (B, pads), pad frame, are those of the last step.
+        contact: of the gels; ``contact.wrenches`` (B, pads), pad frame, are those of the last step, and ``contact.motion.pose``
+            (B, pads, bodies + pads) are the poses of everything in the pads' frames after it.
         engine: MuJoCo Warp's states; ``engine.active`` (B,) are the environments that have not broken down.
         models: of the environments; ``vary`` gives them others, which ``check`` uploads.
-        target, target_speed: of the arm's joints (B, n), float64, on the device; at the start where the joints are, at rest.
+        state: Warp arrays (B, …), float64, after the last step or reset: ``time``, ``joints``, ``speed``, ``tool`` (4, 4), ``fingers``,
+            ``pads`` (pads, 4, 4) and ``bodies`` (bodies, 4, 4), in the order of ``composed``.
     """
 
     def __init__(
@@ -76,40 +83,109 @@ class WarpWorld:
         pairs = GelPairs([spec.gelpad for spec in composed.sensor_specs], pads.carriers, num_envs, device=name).pairs
         self.contact = gel_contact(composed, self.models, pairs, num_envs=num_envs, device=name)
         self.engine = MujocoWarp(self.contact, pads, self.models, contacts=contacts, rows=rows)
-        self._reader = self.engine.reader({key: one for key, one in arm.numbers().items() if key in _READ})
+        known = arm.numbers()
+        known["tool"] = known["site"]
+        known |= {"fingers": numbers("qpos", composed.fingers), "pads": site_pose(pads.sites), "bodies": body_pose(pads.bodies)}
+        self._reader = self.engine.reader(known)
+        self.state = self._reader.arrays
+        posture = composed.start[arm.qpos]
+        self._servo: Any = PoseServo(arm, max_velocity=np.array(MAX_VELOCITY), posture=posture).struct(self.state)
+        self._servo.duration.fill_(composed.control_timestep)
         springs: Any = Springs()
-        for key in _READ:
-            setattr(springs, key, self._reader.arrays[key])
+        for key in _SPRINGS:
+            setattr(springs, key, self.state[key])
         with wp.ScopedDevice(self.engine.device):
-            shape = num_envs, len(arm)
-            springs.target, springs.target_speed, springs.torque = (wp.zeros(shape, dtype=wp.float64) for _ in range(3))
+            springs.target, springs.target_speed = self._servo.step, self._servo.velocity
+            springs.torque = wp.zeros((num_envs, len(arm)), dtype=wp.float64)
             springs.start = wp.zeros(num_envs, dtype=wp.float64)
-            self._motors = wp.array(arm.motors, dtype=wp.int32)
+            springs.time = self.engine.elapsed
+            self._motors, self._joints = (wp.array(index, dtype=wp.int32) for index in (arm.motors, arm.qpos))
+            self._all = wp.full(num_envs, value=True, dtype=wp.bool)
+            self._start = wp.array(np.repeat(composed.start[None], num_envs, axis=0), dtype=wp.float32)
+            self._placed = wp.clone(self._start)
+            self._ctrl = wp.array(np.repeat(composed.ctrl[None], num_envs, axis=0), dtype=wp.float32)
+            self._opening = None
+            if composed.opening is not None:
+                self._gap = wp.array(composed.ctrl[[composed.opening]], dtype=wp.float64)
+                self._gripper = wp.array([composed.opening], dtype=wp.int32)
+                self._opening = wp.zeros((num_envs, 1), dtype=wp.float64)
         springs.stiffness, springs.damping = frequency**2, 2.0 * frequency
-        self._springs, self.target, self.target_speed = springs, springs.target, springs.target_speed
+        self._springs = springs
         self._graph: Callable[[], None] | None = None
         self.reset()
 
-    def reset(self, qpos: np.ndarray | None = None, envs: np.ndarray | None = None) -> None:
-        """Put environments (a mask (B,), or None for all) to positions ``qpos`` (B, nq), or to the scene's start, with targets there.
+    @property
+    def target(self) -> wp.array:
+        """Targets of the arm's joints (B, n), float64, to be written in place; at the start where the joints are."""
+        return self._springs.target
 
-        Raises ``InputError`` for arrays of another shape.
+    @property
+    def target_speed(self) -> wp.array:
+        """Speeds of the joints' targets in a control step (B, n), float64, to be written in place; 0 at the start."""
+        return self._springs.target_speed
+
+    @property
+    def tool_target(self) -> wp.array:
+        """Poses (B, 4, 4) that the tools are to have at the start of a control step, float64, to be written in place; for ``aim``."""
+        return self._servo.target
+
+    @property
+    def tool_twist(self) -> wp.array:
+        """Their velocities in the step (B, 6) [m/s, rad/s], world axes, float64, to be written in place; for ``aim``."""
+        return self._servo.twist
+
+    @property
+    def opening(self) -> wp.array | None:
+        """Commanded gap between two pads (B, 1) [m], float64, to be written in place; None without a gripper."""
+        return self._opening
+
+    def reset(
+        self,
+        qpos: np.ndarray | wp.array | None = None,
+        envs: np.ndarray | wp.array | None = None,
+        *,
+        bodies: Mapping[str, np.ndarray | wp.array] | None = None,
+    ) -> None:
+        """Put environments to positions, or to the scene's start, with the arm's targets there.
+
+        With Warp arrays on the device it launches kernels only. Where a body starts beyond a gel's bonded face, the environment is not
+        active.
+
+        Args:
+            qpos: positions (B, nq); None is the scene's start.
+            envs: a mask (B,), bool; None for all.
+            bodies: other starts of free bodies: name to ``world_from_body`` (B, 4, 4), float64.
+
+        Raises:
+            InputError: arrays of another shape, numbers of the host that are not finite, or a body that is not free.
         """
-        composed, arm, count = self.composed, self.composed.arm, self.engine.num_envs
-        assert arm is not None
-        if qpos is None:
-            qpos = np.repeat(composed.start[None], count, axis=0)
-        qpos = check_numbers("qpos", qpos, (count, composed.model.nq))
-        chosen = np.ones(count, bool) if envs is None else np.asarray(envs)
-        if chosen.shape != (count,) or chosen.dtype != bool:
-            raise InputError("envs", value=chosen.shape, rule=f"must be a mask of {count} environments")
-        with wp.ScopedDevice(self.engine.device):
-            mask, ctrl = wp.array(chosen, dtype=wp.bool), np.repeat(composed.ctrl[None], count, axis=0)
-            self.engine.reset(mask, wp.array(qpos, dtype=wp.float32), wp.array(ctrl, dtype=wp.float32))
-        self.contact.clear_active(mask)
-        rows = np.where(chosen[:, None], qpos[:, arm.qpos], self.target.numpy())
-        self.target.assign(rows)
-        self.target_speed.assign(np.where(chosen[:, None], 0.0, self.target_speed.numpy()))
+        composed, count = self.composed, self.engine.num_envs
+        shape = count, composed.model.nq
+        positions, chosen = self._placed, self._all
+        if qpos is not None and not isinstance(qpos, wp.array):
+            qpos = self._upload(check_numbers("qpos", qpos, shape, finite=True), wp.float32)
+        wp.copy(positions, self._start if qpos is None else qpos)
+        if isinstance(envs, wp.array):
+            chosen = envs
+        elif envs is not None:
+            mask = np.asarray(envs)
+            if mask.shape != (count,) or mask.dtype != bool:
+                raise InputError("envs", value=mask.shape, rule=f"must be a mask of {count} environments")
+            chosen = self._upload(mask, wp.bool)
+        for name, poses in (bodies or {}).items():
+            free = [key for key, body in composed.bodies.items() if body.qpos >= 0]
+            if name not in free:
+                raise InputError("bodies", value=name, rule="must be the name of a free body", choices=free)
+            if not isinstance(poses, wp.array):
+                poses = self._upload(rigid_poses(f"bodies[{name!r}]", poses, count), wp.float64)
+            self._launch(place_body, count, [poses, composed.bodies[name].qpos, positions])
+        self.engine.reset(chosen, positions, self._ctrl)
+        self.contact.clear_active(chosen)
+        self._launch(aim_at_positions, self.target.shape, [chosen, self._joints, positions, self.target, self.target_speed])
+        if self.opening is not None:
+            self._launch(set_columns, self.opening.shape, [chosen, self._gap, self.opening])
+        self.engine.finish()
+        self._reader.read()
 
     def step(self) -> None:
         """One control step of all environments that are active, towards ``target``, which moves with ``target_speed`` in it."""
@@ -118,22 +194,34 @@ class WarpWorld:
         else:
             self._graph()
 
+    def aim(self) -> None:
+        """Launch the inverse kinematics: ``target`` and ``target_speed`` from ``tool_target`` and ``tool_twist`` (``PoseServo``)."""
+        self._launch(servo_step, self.engine.num_envs, [self._servo])
+
     def launch(self) -> None:
         """Launch a control step, as ``step`` records it: for a graph that does more."""
-        self._reader.read()
-        wp.copy(self._springs.start, self._reader.arrays["time"])
         self.engine.advance(self.drive, scene_steps=self._steps, launches=self._launches)
+        self.engine.finish()
+        self._reader.read()
 
     def drive(self) -> None:
-        """Torques of the springs in the joints."""
+        """Torques of the springs in the joints, and the gripper's command."""
         self._reader.read()
-        wp.launch(joint_springs, dim=self.target.shape, inputs=[self._springs], device=self.engine.device)
+        self._launch(joint_springs, self.target.shape, [self._springs])
         self.engine.write_controls(self._motors, self._springs.torque)
+        if self.opening is not None:
+            self.engine.write_controls(self._gripper, self.opening)
 
     def check(self) -> None:
         """Upload what ``models.vary`` changed; it waits for the device.
 
         Raises ``InputError`` if contacts were lost for want of memory.
         """
-        self.engine.prepare()
         self.contact.vary()
+        self.engine.prepare()
+
+    def _upload(self, values: np.ndarray, dtype: Any) -> wp.array:
+        return wp.array(values, dtype=dtype, device=self.engine.device)
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, device=self.engine.device)

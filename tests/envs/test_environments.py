@@ -252,7 +252,7 @@ def test_the_shipped_policies_read_public_names_only() -> None:
 def test_an_older_version_is_refused_with_the_name_of_the_present_one() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        with pytest.raises(gymnasium.error.DeprecatedEnv, match="raytac/LiftCube-v1"):
+        with pytest.raises(gymnasium.error.DeprecatedEnv, match="raytac/LiftCube-v2"):
             gymnasium.make("raytac/LiftCube-v0")
 
 
@@ -266,12 +266,14 @@ def test_a_held_cube_is_worth_more_the_higher_it_is_and_a_loose_one_nothing() ->
     state = TaskState(
         tool=poses, speed=np.zeros((rows, 3)), body=poses, body_speed=np.zeros((rows, 6)),
         goal=np.full((rows, 3), [0.0, 0.0, 0.08]), wrench={"left": wrench, "right": np.tile([0.0, 0, -1, 0, 0, 0], (rows, 1))},
-        joint_speed=np.zeros((rows, 7)), action=np.zeros((rows, 4)), last_action=np.zeros((rows, 4)),
+        opening=np.array([[0.09], [0.05], [0.04], [0.03], [0.029], [0.03]]), joint_speed=np.zeros((rows, 7)),
+        action=np.zeros((rows, 4)), last_action=np.zeros((rows, 4)),
     )  # fmt: skip
     terms = LiftCube().evaluate(state).terms
     rise = np.clip((height - 0.0155) / 0.0245, 0, 1) * [1, 1, 1, 1, 1, 0]
     np.testing.assert_allclose(terms["lifted"], 15 * rise)
     np.testing.assert_allclose(terms["goal"], 16 * rise * (1 - np.tanh((0.08 - height) / 0.3)))
+    np.testing.assert_allclose(terms["closing"], [0, 0, 0.5, 1, 1, 1], atol=1e-12)
     assert terms["held"].tolist() == [2, 2, 2, 2, 2, 0] and (np.diff(terms["lifted"][:4]) > 0).all() and terms["lifted"][0] == 0
     assert LiftCube().evaluate(state).success.tolist() == [False] * 4 + [True] * 2
 

@@ -84,6 +84,20 @@ def test_a_training_that_was_cut_ends_as_one_that_was_not(tmp_path: Path) -> Non
     assert rated["task"] == "RollBall" and rated["episodes"] == 3 and float(rated["length"]) > 1  # type: ignore[arg-type]
     with pytest.raises(InputError, match="'hidden': 8"):
         train_gpu.main(replace(cut, hidden=9))
+    again = train_gpu.main(replace(cut, steps=64))
+    for name in ("minutes", "env_steps_per_s", "success"):
+        assert again[f"wrench.seed0.{name}"] == resumed[f"wrench.seed0.{name}"], name
+    assert len((tmp_path / "cut/wrench/seed0/evaluation.csv").read_text().splitlines()) == 3
+    for wrong in ({"history": 0}, {"steps": -5}, {"touch": "wrench,taste"}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            replace(cut, **wrong)
+
+
+def test_observations_are_there_before_a_reset() -> None:
+    env = RslVecEnv(RollBallVectorEnv, num_envs=2, tactile=("wrench",), seed=3)
+    first = env.get_observations()
+    assert first["actor"].abs().sum() > 0.0
+    torch.testing.assert_close(env.reset(3), first)
 
 
 def test_metrics_are_of_the_worst_seed_of_the_first_touch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,9 +38,52 @@ def test_a_run_reports_every_check_and_goes_on_where_it_stopped(tmp_path: Path, 
         hard.main(hard.Args(**{**options, "seconds": 0.03}, cases="pin*"))
 
 
+def test_processes_and_parts_measure_what_one_process_does(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    options: dict[str, Any] = {"device": "cpu", "grasps": 8, "cases": "grasps_sphere_0,grasps_cylinder_0,grasps_edge_0"}
+    folders = [tmp_path / name for name in ("one", "two", "both", "alone")]
+    first = hard.main(hard.Args(**options, out=folders[0], part="1/2", processes=2, minutes=5.0))
+    assert first["rigid_hard.total"] == 2 and first["rigid_hard.grasps"] == 2 and first["rigid_hard.missing"] == 0
+    assert "   2/2 grasps_" in capfd.readouterr().out
+    hard.main(hard.Args(**options, out=folders[1], part="2/2"))
+    both = hard.main(hard.Args(cases="grasps*", device="cpu", combine=(folders[0], folders[1]), out=folders[2]))
+    alone = hard.main(hard.Args(**options, out=folders[3]))
+    assert both["rigid_hard.total"] == both["rigid_hard.grasps"] == 3 and both["rigid_hard.missing"] == 5
+    for key, value in alone.items():
+        if key.startswith("rigid_hard") and not key.endswith(("seconds_each", "missing")):
+            assert both[key] == value, key
+    refused: tuple[tuple[dict[str, Any], str], ...] = (
+        ({"combine": (folders[0], folders[2])}, "another folder holds too"),
+        ({"combine": (tmp_path / "none",)}, "no record"),
+        ({"combine": (folders[0],), "out": folders[1]}, "holds a run already"),
+    )
+    for changes, text in refused:
+        with pytest.raises(InputError, match=text):
+            hard.main(hard.Args(**({"out": tmp_path / "new", "device": "cpu"} | changes)))
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "cases.json").write_text((folders[1] / "cases.json").read_text().replace('"grasps": 8', '"grasps": 16'))
+    with pytest.raises(InputError, match="other settings"):
+        hard.main(hard.Args(combine=(folders[0], other), out=tmp_path / "new"))
+    assert not (tmp_path / "new").exists()
+
+
+def test_names_of_failing_cases_are_in_the_metrics() -> None:
+    rows = [{"case": name, "passed": name == "good", "penetration_m": None, "checks": []} for name in ("good", "bad", "worse")]
+    assert hard.summary(rows)["rigid_hard.failing"] == "bad worse"
+
+
 def test_bad_options_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    for options, text in (({"cases": "spike"}, "drop_5g"), ({"seconds": 0.0}, "greater than 0"), ({"grasps": -1}, "0 or more")):
+    for options, text in (
+        ({"cases": "spike"}, "drop_5g"),
+        ({"seconds": 0.0}, "greater than 0"),
+        ({"grasps": -1}, "0 or more"),
+        ({"part": "3/2"}, "1 <= i <= n"),
+        ({"part": "half"}, "1 <= i <= n"),
+        ({"processes": 0}, "1 or more"),
+        ({"processes": 2, "minutes": 0.0}, "greater than 0"),
+        ({"minutes": 1.0}, "two processes"),
+    ):
         with pytest.raises(InputError, match=text):
             hard.main(hard.Args(out=out, device="cpu", **options))  # type: ignore[arg-type]
     assert not out.exists()

@@ -26,7 +26,7 @@ def follow(grid: PadGrid, *surfaces: GelSurface) -> Contacts:
 def test_components_are_those_of_scipy(density: float) -> None:
     mask = np.random.default_rng(0).random((3, 40, 50)) < density
     row, start, stop = find_runs(mask)
-    number = join_runs(row.tolist(), start.tolist(), stop.tolist(), 40)
+    number = join_runs(row, start, stop, 40)
     mine = np.zeros((120, 50), int)
     for k, (r, a, b) in enumerate(zip(row, start, stop, strict=True)):
         mine[r, a:b] = number[k] + 1

@@ -71,7 +71,7 @@ def _narrowest(contact: np.ndarray, surface: GelSurface, mesh: CoatMesh) -> floa
     box = span(contact.any(axis=1)), span(contact.any(axis=0))
     contact, x, y = contact[box], surface.grid.x[box[1]], surface.grid.y[box[0]]
     row, start, stop = find_runs(contact[None])
-    piece = np.array(join_runs(row.tolist(), start.tolist(), stop.tolist(), len(y)))
+    piece = join_runs(row, start, stop, len(y))
     # Runs lie in the order of the nodes, row by row.
     of_node, (rows, columns) = np.repeat(piece, stop - start), contact.nonzero()
     radius = _inscribed(contact, surface.grid.pitch)[rows, columns]

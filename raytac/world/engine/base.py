@@ -1,6 +1,6 @@
 """``Engine``: what steps the bodies of B environments, with room for the contacts of gels between the halves of a step.
 
-``RigidPads`` is the order of a step, written once for every engine::
+``RigidPads`` is the order of a step for engines that the host steps; ``MujocoWarp.advance`` is the same order for one that it does not::
 
     contact.choose(envs, done)      # the environments of this step
     engine.begin_step()             # positions, collision, velocities
@@ -31,8 +31,9 @@ class Engine(Protocol):
     that of the beginning of the step, and its rows are not read.
 
     Attributes:
-        divides: True if each environment takes a step of its own length (``contact.steps.length``), and those that are not named stand
-            still at no cost. If False all steps are the scene's, and row i is environment i.
+        divides: True if the host names the environments of every step, those that are not named stand still at no cost, and rows are
+            compact: what ``RigidPads`` needs. If False row i is environment i, and the engine has the order of a step itself, so that
+            nothing waits for the host.
         device: of all arrays.
     """
 

@@ -120,13 +120,15 @@ def read_frames(
     roots: wp.array(dtype=wp.int32),
     last: wp.array(dtype=wp.int32),
     parents: wp.array(dtype=wp.int32),
+    share: wp.array(dtype=wp.float64),
     # outputs
     frames: Frames,
 ):
     """Frames of pads, at their sites, and of bodies, with their velocities and free accelerations.
 
     ``bodies``: those that carry the pads first; ``roots``: of their kinematic trees; ``last``: last degree of freedom that moves each, −1
-    of none; ``parents``: of the degrees of freedom. As in a constraint row, the accelerations hold nothing of what velocities alone give.
+    of none; ``parents``: of the degrees of freedom; ``share``: of each one's acceleration that comes, as damping is implicit
+    (``ImplicitDamping``). As in a constraint row, the accelerations hold nothing of what velocities alone give.
     """
     row, k = wp.tid()
     env, body = steps.envs[row], bodies[k]
@@ -151,8 +153,9 @@ def read_frames(
     swing, push = wp.vec3d(), wp.vec3d()
     dof = last[k]
     while dof >= 0:
-        swing += smooth[dof] * vector(axes, 2 * dof)
-        push += smooth[dof] * vector(axes, 2 * dof + 1)
+        value = share[dof] * smooth[dof]
+        swing += value * vector(axes, 2 * dof)
+        push += value * vector(axes, 2 * dof + 1)
         dof = parents[dof]
     frames.swing[row, k] = swing
     frames.push[row, k] = push + wp.cross(swing, place - about)

@@ -31,7 +31,7 @@ from raytac.world.engine.c_kernels import (
 )
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.implicit_damping import ImplicitDamping
-from raytac.world.pad_contact import PadIndices
+from raytac.world.pad_contact import PadIndices, last_dofs
 from raytac.world.world_state import lost
 
 
@@ -85,11 +85,11 @@ class CMujoco:
         for name in _INTEGERS:
             setattr(memory, name, one.offset[name] // 4)
         steps, slots, bodies = contact.steps, contact.slots, np.concatenate([pads.carriers, pads.bodies])
-        roots, last = model.body_rootid[bodies], np.array([_last_dof(model, body) for body in bodies.tolist()])
+        roots, last = model.body_rootid[bodies], last_dofs(model, bodies)
         indices = [_array(values) for values in (pads.sites, bodies, roots, last, model.dof_parentid)]
         gels, others = _array(pads.geoms[len(pads.bodies) :]), _array(pads.geoms)
         launch = partial(wp.launch, device="cpu")
-        frames = [memory, steps, *indices, contact.frames]
+        frames = [memory, steps, *indices, wp.array(self._damping.share, dtype=wp.float64, device="cpu"), contact.frames]
         forces = [memory, slots, steps, contact.force, contact.velocity]
         self.read_frames = partial(launch, read_frames, dim=(num_envs, len(bodies)), inputs=frames)
         self.read_rows = partial(launch, read_constraint, dim=num_envs, inputs=forces)
@@ -240,13 +240,6 @@ class CMujoco:
 
 _SOLVES = 5
 """Solves of MuJoCo's at most for the lift of a slide that begins or ends."""
-
-
-def _last_dof(model: mujoco.MjModel, body: int) -> int:
-    """Last degree of freedom that moves a body; −1 of one that stands still."""
-    while body and not model.body_dofnum[body]:
-        body = int(model.body_parentid[body])
-    return int(model.body_dofadr[body] + model.body_dofnum[body]) - 1 if body else -1
 
 
 def _array(values: np.ndarray) -> wp.array:

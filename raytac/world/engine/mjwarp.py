@@ -25,7 +25,7 @@ from raytac.warp_runtime import start_warp
 from raytac.world.engine import mjwarp_kernels as kernels
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.implicit_damping import ImplicitDamping
-from raytac.world.pad_contact import PadIndices
+from raytac.world.pad_contact import PadIndices, last_dofs
 from raytac.world.world_state import LARGEST_SPEED
 
 _SLIDES = 2
@@ -47,6 +47,7 @@ class MujocoWarp:
         divides, device: as of ``Engine``.
         num_envs: B.
         timestep: of the scene's steps [s].
+        elapsed: time since ``advance`` began [s], (B,), which does not lose digits as MuJoCo Warp's clock does.
         active: environments that are stepped (B,), bool; those that break down are no longer.
         model, data: MuJoCo Warp's.
         peaks: most contacts of all environments at once, most pairs of MuJoCo's collision, most rows of one environment, and flags of
@@ -73,7 +74,8 @@ class MujocoWarp:
             models: of the environments; a variation may replace one.
             timestep: of the scene's steps [s], which divide into shorter ones; None is the models'.
             contacts, rows: memory for contacts and constraint rows, an environment each; None is a guess. All environments share the
-                memory for contacts. If it is too small, ``prepare`` and ``check_overflow`` raise an error.
+                memory for contacts. Where it is too small, environments are no longer active, and ``prepare`` and ``check_overflow``
+                raise an error.
 
         Raises:
             BackendError: MuJoCo Warp is not installed.
@@ -91,7 +93,8 @@ class MujocoWarp:
         slots = len(pads.sites), len(pads.geoms)
         self._contacts = 24 + 2 * slots[0] * slots[1] + 4 * slots[1] if contacts is None else contacts
         self._rows = 4 * self._contacts if rows is None else rows
-        self._damped = ImplicitDamping(model).matters
+        damping = ImplicitDamping(model)
+        self._damped = damping.matters
         with wp.ScopedDevice(self.device):
             sizes = {name: num_envs for name in _VARIED if getattr(model, name).size}
             try:
@@ -106,6 +109,7 @@ class MujocoWarp:
             shape = num_envs, *slots
             self._own: Any = kernels.Own()
             self.active, self._done = wp.full(num_envs, value=True, dtype=wp.bool), wp.zeros(num_envs, dtype=wp.int32)
+            self.elapsed = wp.zeros(num_envs, dtype=wp.float64)
             self._own.first, self._own.sliding = wp.zeros(1, dtype=wp.int32), wp.zeros(num_envs, dtype=wp.int32)
             self._own.contact, self._own.scale = wp.full(shape, -1, dtype=wp.int32), wp.zeros(shape, dtype=wp.float64)
             self._saved: Any = kernels.Saved()
@@ -114,9 +118,10 @@ class MujocoWarp:
             self._saved.warmstart = wp.clone(self.data.qacc_warmstart)
             self._mass, self._damped_mass = wp.empty_like(self.data.M), wp.empty_like(self.data.M)
             self.peaks = wp.zeros(4, dtype=wp.int32)
+            self._losses = sum(int(flag) for flag in mjw.OverflowType if flag.name in _LOST)
             bodies = np.concatenate([pads.carriers, pads.bodies])
-            last = np.array([_last_dof(model, body) for body in bodies.tolist()])
-            self._sites, self._bodies, self._last = (_array(values) for values in (pads.sites, bodies, last))
+            self._sites, self._bodies, self._last = (_array(values) for values in (pads.sites, bodies, last_dofs(model, bodies)))
+            self._share = wp.array(damping.share, dtype=wp.float64)
             self._others, self._hard = _array(pads.geoms), _array(pads.hard)
             self._gels = _array(pads.geoms[len(pads.bodies) :])
         self._models = [models[0]] * num_envs
@@ -187,8 +192,8 @@ class MujocoWarp:
 
     def read_frames(self) -> None:
         """As of ``Engine``."""
-        shape = self.num_envs, len(self._bodies)
-        self._launch(kernels.read_frames, shape, [self._worlds, self._sites, self._bodies, self._last, self._contact.frames])
+        shape, frames = (self.num_envs, len(self._bodies)), (self._worlds, self._sites, self._bodies, self._last)
+        self._launch(kernels.read_frames, shape, [*frames, self._share, self._contact.frames])
 
     def put_contacts(self, *, own_step: bool = True) -> None:
         """As of ``Engine``, and make all constraints; a contact for which there is no memory is an error of ``prepare``."""
@@ -224,7 +229,7 @@ class MujocoWarp:
             if self._damped:
                 wp.copy(self.data.M, self._mass)
             self._mjw.implicit(self.model, self.data)
-        self._launch(kernels.end_states, self.num_envs, [self._worlds, self._saved, steps, self.peaks])
+        self._launch(kernels.end_states, self.num_envs, [self._worlds, self._saved, steps, self._losses, self.peaks])
         self._launch(kernels.end_worlds, self.num_envs, [steps, self._done, self.active])
 
     def read_rows(self) -> None:
@@ -241,7 +246,9 @@ class MujocoWarp:
         count = scene_steps if launches is None else launches
         if count < scene_steps:
             raise InputError("launches", value=launches, rule=f"must be {scene_steps} or more, one for each of the scene's steps")
+        self._done.zero_()
         for k in range(count):
+            self._launch(kernels.read_elapsed, self.num_envs, [self._done, self.timestep / self._contact.ticks, self.elapsed])
             self.begin_step()
             drive()
             self.free_acceleration()
@@ -252,6 +259,17 @@ class MujocoWarp:
             self.end_step()
             self.read_rows()
             self._contact.end()
+
+    def finish(self) -> None:
+        """Poses of the present positions, in the world and in the pads' frames, without the host.
+
+        Environments in which a body has gone through a pad are no longer active.
+        """
+        self.update_poses()
+        self._contact.choose_active(self.active)
+        self.read_frames()
+        self._contact.move()
+        self._launch(kernels.end_worlds, self.num_envs, [self._contact.steps, self._done, self.active])
 
     def update_poses(self) -> None:
         """As of ``Engine``."""
@@ -388,13 +406,6 @@ def _worlds(model: Any, data: Any) -> Any:
     for name in ("J", "D", "vel", "aref", "force"):
         setattr(result, name, getattr(data.efc, name))
     return result
-
-
-def _last_dof(model: mujoco.MjModel, body: int) -> int:
-    """Last degree of freedom that moves a body; −1 of one that stands still."""
-    while body and not model.body_dofnum[body]:
-        body = int(model.body_parentid[body])
-    return int(model.body_dofadr[body] + model.body_dofnum[body]) - 1 if body else -1
 
 
 def _array(values: np.ndarray) -> wp.array:

@@ -201,6 +201,13 @@ def choose_worlds(
 
 
 @wp.kernel
+def read_elapsed(done: wp.array(dtype=wp.int32), tick: wp.float64, elapsed: wp.array(dtype=wp.float64)):
+    """Time [s] of the ticks behind each environment; ``tick``: length of one [s]."""
+    i = wp.tid()
+    elapsed[i] = wp.float64(done[i]) * tick
+
+
+@wp.kernel
 def end_worlds(steps: Steps, done: wp.array(dtype=wp.int32), active: wp.array(dtype=wp.bool)):
     """Count the ticks of a step; an environment whose physics broke down in it is no longer ``active``."""
     i = wp.tid()
@@ -224,13 +231,15 @@ def read_frames(
     sites: wp.array(dtype=wp.int32),
     bodies: wp.array(dtype=wp.int32),
     last: wp.array(dtype=wp.int32),
+    share: wp.array(dtype=wp.float64),
     # outputs
     frames: Frames,
 ):
     """Frames of pads, at their sites, and of bodies, with their velocities and free accelerations.
 
-    ``bodies``: those that carry the pads first; ``last``: last degree of freedom that moves each, −1 of none. As in a constraint row, the
-    accelerations hold nothing of what velocities alone give.
+    ``bodies``: those that carry the pads first; ``last``: last degree of freedom that moves each, −1 of none; ``share``: of the
+    acceleration of each that comes, as damping is implicit (``ImplicitDamping``). As in a constraint row, the accelerations hold nothing of
+    what velocities alone give.
     """
     i, k = wp.tid()
     body = bodies[k]
@@ -252,7 +261,7 @@ def read_frames(
     swing, push = wp.vec3d(), wp.vec3d()
     dof = last[k]
     while dof >= 0:
-        smooth, axis = wp.float64(worlds.qacc_smooth[i, dof]), worlds.cdof[i, dof]
+        smooth, axis = share[dof] * wp.float64(worlds.qacc_smooth[i, dof]), worlds.cdof[i, dof]
         swing += smooth * double3(wp.spatial_top(axis))
         push += smooth * double3(wp.spatial_bottom(axis))
         dof = worlds.dof_parentid[dof]
@@ -266,7 +275,8 @@ def append_contacts(
 ):
     """Put the contacts of the slots that are held after MuJoCo's own.
 
-    ``gels``, ``others``: geoms of the pads and of all that they touch. What does not fit is counted in ``nacon`` all the same.
+    ``gels``, ``others``: geoms of the pads and of all that they touch. What does not fit is counted in ``nacon`` all the same, and its
+    environment is lost.
     """
     i, pad, body = wp.tid()
     own.contact[i, pad, body] = -1
@@ -274,6 +284,7 @@ def append_contacts(
         return
     k = wp.atomic_add(worlds.nacon, 0, 1)
     if k >= worlds.dist.shape[0]:
+        steps.lost[i] = 1
         return
     own.contact[i, pad, body] = k
     # The solver's cone is that of the dual one with the rows scaled by √R.
@@ -432,10 +443,13 @@ def add_damping(worlds: Worlds, steps: Steps, damped: wp.array2d(dtype=wp.float3
 
 
 @wp.kernel
-def end_states(worlds: Worlds, saved: Saved, steps: Steps, peaks: wp.array(dtype=wp.int32)):
+def end_states(worlds: Worlds, saved: Saved, steps: Steps, losses: wp.int32, peaks: wp.array(dtype=wp.int32)):
     """Mark environments whose physics broke down, and put them and those left out back to where the step began.
 
-    A number is not finite then, or a joint is far too fast. ``peaks``: most contacts of all environments, most pairs of MuJoCo's collision,
+    A number is not finite then, a joint is far too fast, or MuJoCo Warp has lost contacts for want of memory, as one of the flags
+    ``losses`` says: of the list that all share it cannot say whose.
+
+    ``peaks``: most contacts of all environments, most pairs of MuJoCo's collision,
     most rows of one environment, and all of MuJoCo Warp's flags of overflow so far, which a reset clears there.
     """
     i = wp.tid()
@@ -445,6 +459,8 @@ def end_states(worlds: Worlds, saved: Saved, steps: Steps, peaks: wp.array(dtype
     wp.atomic_max(peaks, 2, worlds.nefc[i])
     if worlds.overflow[i] != 0:
         wp.atomic_or(peaks, 3, worlds.overflow[i])
+        if (worlds.overflow[i] & losses) != 0:
+            steps.lost[i] = 1
     total = wp.float32(0.0)
     for k in range(worlds.qvel.shape[1]):
         if not wp.abs(worlds.qvel[i, k]) < _LARGEST_SPEED:

@@ -1,0 +1,36 @@
+"""Observations that every task has, of B environments; arrays of NumPy, or of PyTorch on any device."""
+
+from __future__ import annotations
+
+from array_api_compat import array_namespace
+
+from raytac.envs.task_rules import Array
+
+_LENGTH, _SPEED = 0.1, 1.0
+"""Scales of positions [m] and speeds [m/s, rad/s]."""
+
+
+def state_and_goal(
+    tool: Array, start: Array, turn: Array, speed: Array, opening: Array, action: Array, goal: Array
+) -> dict[str, Array]:
+    """``state`` (B, n) and ``goal`` (B, 3), float32.
+
+    Args:
+        tool, start: poses (B, 4, 4) of the tool and (4, 4) in the scene.
+        turn: rotation vectors from the latter (B, 3) [rad].
+        speed: of the tool (B, 3) [m/s].
+        opening: gap between two pads (B, 1) [m]; (B, 0) without a gripper.
+        action: last ones (B, k).
+        goal: positions (B, 3) [m].
+    """
+    xp, position = array_namespace(tool), tool[:, :3, 3]
+    parts = [(position - start[:3, 3]) / _LENGTH, turn, speed / _SPEED, opening / _LENGTH, action]
+    values = {"state": xp.concat(parts, axis=1), "goal": (goal - position) / _LENGTH}
+    return {name: xp.astype(array, xp.float32) for name, array in values.items()}
+
+
+def body_from_tool(tool: Array, body: Array, speed: Array) -> Array:
+    """``body`` (B, 15), float32: position from the tool, first two columns of the rotation, velocity and angular velocity (B, 6)."""
+    xp = array_namespace(tool)
+    place = (body[:, :3, 3] - tool[:, :3, 3]) / _LENGTH
+    return xp.astype(xp.concat([place, body[:, :3, 0], body[:, :3, 1], speed / _SPEED], axis=1), xp.float32)
