@@ -16,8 +16,8 @@ import numpy as np
 import warp as wp
 
 from raytac.errors import InputError
+from raytac.robots.arm_kernels import Entries, read_numbers, write_numbers
 from raytac.robots.mujoco_memory import checked_layouts, same_states
-from raytac.robots.state_kernels import Entries, read_numbers, write_numbers
 from raytac.warp_runtime import Recorded, start_warp
 
 _CONSTANT = -1
