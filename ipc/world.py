@@ -81,8 +81,6 @@ class World:
         self._start = start_state(self.layout, num_envs, self.kappa)
         self.restore(self._start)
 
-    # --- driving ---------------------------------------------------------------------------------------------------------------
-
     def _index(self, name: str) -> int:
         if name not in self.layout.names:
             raise IpcError(f"no body is named {name!r}: choose from {', '.join(self.layout.names)}")
@@ -135,8 +133,6 @@ class World:
         v[mask, nodes] = per_env(velocity, (3,), "velocity", self.num_envs)[mask, None]
         self._potential.v.assign(v)
 
-    # --- stepping --------------------------------------------------------------------------------------------------------------
-
     def step(self, dt: float | None = None) -> StepReport:
         """Advance every environment that has not failed by ``dt`` [s]; None: by ``settings.dt``.
 
@@ -181,8 +177,6 @@ class World:
     def timers(self) -> dict[str, float]:
         """Seconds spent in ``step`` and its stages (on CUDA without ``Settings.cuda_graph``)."""
         return dict(self._newton.timers)
-
-    # --- outputs ---------------------------------------------------------------------------------------------------------------
 
     def frame(self, name: str) -> tuple[Floats, Floats]:
         """World rotations (B, 3, 3) and positions [m] (B, 3) of a driven body's or grip's frame."""
@@ -312,8 +306,6 @@ class World:
             raise IpcError(f"env = {env}: environments are 0 to {self.num_envs - 1}")
         s = self._potential
         return find_overlap(self.layout, host(s.x)[env], host(s.R)[env, :, :, 2], host(s.t)[env])
-
-    # --- state -----------------------------------------------------------------------------------------------------------------
 
     def save(self) -> State:
         """A copy of the state of every environment."""

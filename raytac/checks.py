@@ -1,7 +1,4 @@
-"""Checks of arguments.
-
-Each returns the value in its own type, or raises ``InputError`` with the argument's name, value and rule.
-"""
+"""Checks of arguments: each returns the value in its own type, or raises ``InputError``."""
 
 from __future__ import annotations
 
@@ -39,10 +36,7 @@ MOST_ENVIRONMENTS = 2**24
 
 @dataclass(frozen=True)
 class Interval:
-    """A range of numbers, written as in mathematics: ``[0, 1)``.
-
-    A closed infinite end admits ``inf`` itself.
-    """
+    """A range as in mathematics, ``[0, 1)``; a closed infinite end admits ``inf`` itself."""
 
     low: float
     high: float

@@ -1,7 +1,4 @@
-"""Devices: choose CPU or CUDA, and find the LLVM library of Dr.Jit's CPU code.
-
-Nothing here imports Mitsuba, Dr.Jit or Warp, so that asking is cheap and safe.
-"""
+"""Devices and the LLVM library of Dr.Jit's CPU code; imports no Mitsuba, Dr.Jit or Warp."""
 
 from __future__ import annotations
 

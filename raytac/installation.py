@@ -8,10 +8,7 @@ from pathlib import Path
 
 
 def foreign_ipc() -> str | None:
-    """Return the place of a foreign ``ipc`` package that ``import ipc`` would take, or None.
-
-    The other package is not run: its file is read as text.
-    """
+    """Place of a foreign ``ipc`` that ``import ipc`` would take, or None; read, and not run."""
     spec = importlib.util.find_spec("ipc")
     if spec is None:
         return "nowhere: there is no package of that name"

@@ -121,10 +121,7 @@ def query(
     # outputs
     candidates: Candidates,
 ):
-    """Vertices against faces, or edges against edges (``ee``), of bodies that may touch.
-
-    Within one body each pair of edges is looked at once.
-    """
+    """Vertices against faces, or edges (``ee``), of bodies that may touch; each pair once."""
     env, i = wp.tid()
     if stale[env] == 0:
         return

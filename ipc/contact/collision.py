@@ -294,10 +294,7 @@ class Collision:
     # --- friction --------------------------------------------------------------------------------------------------------------
 
     def lag(self, active: wp.array, changed: wp.array) -> None:
-        """Freeze the contacts of the active environments for friction.
-
-        ``changed`` (B,) becomes by how much the friction limits μ λ n changed, as a share of their sum.
-        """
+        """Freeze active contacts for friction; ``changed`` (B,): relative change of limits μ λ n."""
         limits, vertices = self.lagged.limit.shape, self._change.shape
         self._launch(friction.keep_lagged, limits, [self.lagged, active], [self._old])
         self._launch(friction.lag_contacts, limits, [self.contacts, self.pair_mu, active], [self.lagged])

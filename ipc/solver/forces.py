@@ -83,10 +83,7 @@ def bond_wrench(potential: Potential, body: int, frame: int, nodes: Ints) -> Wre
 
 
 def contact_wrench(layout: Layout, potential: Potential, body: int) -> Wrench:
-    """Contact and friction forces on a body, about its frame's origin or the world's.
-
-    Those on a half-space are the reactions on the vertices that touch it.
-    """
+    """Contact and friction forces on a body (reactions of a half-space), own or world's origin."""
     x, t = host(potential.x), host(potential.t)
     if layout.half_space[body]:
         points, forces = x, np.zeros_like(x)

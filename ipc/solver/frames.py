@@ -1,7 +1,4 @@
-"""Driven frames, and the maps between nodes and vertices.
-
-Nodes are unknowns, in the frame of their body; vertices are surface points, in the world.
-"""
+"""Driven frames; maps between nodes (unknowns, body frames) and vertices (surface, world)."""
 
 # pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportInvalidTypeForm=false
 

@@ -72,10 +72,7 @@ def case_light(seen: PixelGeometry) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Light:
-    """Light of every LED at power 1 by channel, each (L, M, 3).
-
-    In the pixels of presses, in the same pixels at rest, and over the image at rest.
-    """
+    """Light of every LED at power 1, (L, M, 3): of presses, of their pixels at rest, over rest."""
 
     pressed: np.ndarray
     flat: np.ndarray

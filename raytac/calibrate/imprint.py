@@ -113,10 +113,7 @@ def pixel_geometry(
 def press_surface(
     sensor: SensorSpec, grid: PadGrid, circles: np.ndarray, ball_radius: np.ndarray, slopes: np.ndarray
 ) -> GelSurface:
-    """The pad under every ball as a batch of surfaces on ``grid``.
-
-    Arguments as of ``pixel_geometry``. Raises InputError: a contact circle as wide as its ball.
-    """
+    """The pad under every ball, a batch on ``grid``; InputError: a circle as wide as its ball."""
     on_pad = circles_on_pad(sensor, circles, ball_radius)
     share = on_pad[:, 2] / ball_radius
     if (share >= 1).any():

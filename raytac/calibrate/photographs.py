@@ -70,10 +70,7 @@ def decode(levels: np.ndarray, gamma: float) -> np.ndarray:
 
 
 def photographs_of(presses: RealPresses, sensor: SensorSpec) -> Photographs:
-    """The fully visible presses, at the sensor's own resolution.
-
-    Raises InputError: images of another size than the sensor's, no fully visible press, or a circle as wide as its ball.
-    """
+    """The fully visible presses at the sensor's resolution; InputError for none or other sizes."""
     if presses.resolution != sensor.camera.resolution:
         rule = f"must have images of the sensor's size, {sensor.camera.resolution}"
         raise InputError("data", value=presses.resolution, rule=rule)

@@ -234,10 +234,7 @@ def by_half(presses: RealPresses) -> list[Split]:
 
 
 def shallow_to_deep(presses: RealPresses, share: float = 0.5) -> Split:
-    """Split from the shallower ``share`` of the presses to the deeper ones.
-
-    Depth over the ball's radius grows with the circle over it. Raises InputError for a share that leaves one side empty.
-    """
+    """Split from the shallower ``share`` of presses to the deeper; InputError for an empty side."""
     relative = _known(presses)[:, 2] / presses.ball_radius
     order, cut = np.argsort(relative, kind="stable"), round(share * len(presses))
     if not 0 < cut < len(presses):

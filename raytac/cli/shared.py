@@ -14,6 +14,7 @@ from raytac.calibrate.light_parameters import leds_at_walls, leds_split
 from raytac.calibrate.photographs import Photographs, photographs_of
 from raytac.calibrate.presses import RealPresses, read_presses
 from raytac.calibrate.prior_choice import INNER, STRENGTHS
+from raytac.checks import check_known
 from raytac.errors import InputError
 from raytac.io.options import CommonOptions
 from raytac.physics.base import PhysicsConfig
@@ -97,9 +98,7 @@ class FitOptions(CommonOptions):
     @property
     def chosen_prior(self) -> str | None:
         """``--prior``; None is ``INNER``. Raises ``InputError`` for no name of ``STRENGTHS``."""
-        if self.prior not in (INNER, *STRENGTHS):
-            raise InputError("prior", value=self.prior, rule="must be a known strength", choices=(INNER, *STRENGTHS))
-        return None if self.prior == INNER else self.prior
+        return None if check_known("prior", self.prior, (INNER, *STRENGTHS)) == INNER else self.prior
 
     def read(self, data: Path, sensor: str) -> tuple[SensorSpec, RealPresses, Photographs]:
         """As ``read_data``; doubtful circles are printed."""

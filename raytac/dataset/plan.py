@@ -109,8 +109,6 @@ class DatasetPlan:
             TactileSensor(sensor, **self.sensor_options(1), device="cpu")
             self._check_markers(sensor)
 
-    # --- shards ----------------------------------------------------------------------------------------------------------------
-
     @property
     def shards(self) -> int:
         """Number of shards."""
@@ -159,8 +157,6 @@ class DatasetPlan:
             shear_y=length * np.sin(azimuth),
             twist=between(r.twist, u[8]),
         )
-
-    # --- sensors ---------------------------------------------------------------------------------------------------------------
 
     def sensor_options(self, num_envs: int) -> dict[str, Any]:
         """Keyword arguments of the ``TactileSensor`` of a sweep, but for sensor and device."""
@@ -216,8 +212,6 @@ class DatasetPlan:
             absent = self.shards * self.sweep.shard_size - self.sweep.count
             total -= absent * self.press_bytes(self.sweep.sensors[last % kinds])
         return total
-
-    # --- identity --------------------------------------------------------------------------------------------------------------
 
     @cached_property
     def description(self) -> dict[str, Any]:

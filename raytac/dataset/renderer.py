@@ -102,8 +102,6 @@ class ShardRenderer:
         made_by = {"device": built.sensor.device_used, "mode": built.sensor.label, **versions(), **git_state()}
         return ShardResult(shard, joined | built.shared if order else {}, rows, made_by)
 
-    # --- sensors ---------------------------------------------------------------------------------------------------------------
-
     def _for(self, shard: int) -> _Built:
         key = self.plan.variant(shard)
         if key in self._built:
@@ -123,8 +121,6 @@ class ShardRenderer:
             shared["rest_rgb"] = rest.rgb[0]
         drift = CameraDrift(spec, plan.randomization, batch, 0) if plan.randomization.changes_images else None
         return _Built(sensor, drift, shared)
-
-    # --- presses ---------------------------------------------------------------------------------------------------------------
 
     def _press(self, built: _Built, scene: PressScene, presses: Presses) -> tuple[TactileFrame, list[str]]:
         """Frame of B environments, the first of which are the presses, and why each failed (or "")."""
@@ -203,8 +199,6 @@ class ShardRenderer:
         built.drift.reseed(which, presses.seed.tolist())
         built.drift.reset(which)
         return built.drift.apply(rgb)
-
-    # --- figures ---------------------------------------------------------------------------------------------------------------
 
     def _row(self, shard: int, presses: Presses, place: int, note: Mapping[str, Any]) -> Row:
         which, copy = self.plan.variant(shard)

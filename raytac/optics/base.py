@@ -119,10 +119,7 @@ class OpticsConfig(Generic[Mode]):
         return self.maker()(spec, self, resolution=resolution, outputs=outputs, device=device, seed=seed)
 
     def maker(self) -> Callable[..., Mode]:
-        """Class of the mode, called with ``(spec, self, resolution, outputs, device, seed)``.
-
-        It is imported in here, so that a configuration loads no renderer.
-        """
+        """Class of the mode, called with ``(spec, self, resolution, outputs, device, seed)``."""
         raise NotImplementedError
 
     def check(self, spec: SensorSpec) -> None:

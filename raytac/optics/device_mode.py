@@ -237,10 +237,7 @@ class DeviceMode(ABC):
         return images
 
     def _pressed(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> list[int]:
-        """Environments to render, as many as some power of two; others show the image at rest.
-
-        Marker dots may lie differently in every environment, so with dots it is all of them.
-        """
+        """Environments to render: a power of two, the others are at rest; all if dots may differ."""
         if surface.ink is not None:
             return list(range(surface.batch))
         rest = surface.grid.rest.astype(np.float32)

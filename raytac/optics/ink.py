@@ -19,10 +19,7 @@ dots; 0.20 to 0.38 across the pad; 2026-11-21). Where s = 0, as in the shipped s
 
 
 def checked_ink(surface: GelSurface) -> np.ndarray | None:
-    """The surface's ink, (B, Ny, Nx) float32; None if it has none.
-
-    Raises InputError: another shape than the heights', or values outside [0, 1].
-    """
+    """The surface's ink (B, Ny, Nx), or None. InputError: another shape, or beyond [0, 1]."""
     if surface.ink is None:
         return None
     ink = np.ascontiguousarray(surface.ink, dtype=np.float32)

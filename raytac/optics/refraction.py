@@ -70,10 +70,7 @@ class Slab:
         return 1 - mi.fresnel(cos_air, self.ior)[0]
 
     def refract(self, mi: Any, d: Any) -> tuple[Any, Any]:
-        """(direction behind the plane, Fresnel reflectance) of unit ``d``, from either side.
-
-        Under total internal reflection the reflectance is 1 and the direction has no meaning.
-        """
+        """(direction behind the plane, Fresnel reflectance) of unit ``d``; 1 for total reflection."""
         # The outer normal is −z, so a positive cosine of the incident side means air.
         reflectance, cos_t, _, eta_ti = mi.fresnel(d.z, self.ior)
         return dr.normalize(mi.Vector3f(d.x * eta_ti, d.y * eta_ti, -cos_t)), reflectance

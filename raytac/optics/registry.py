@@ -21,10 +21,7 @@ register = OPTICS.register
 
 
 def chosen_optics(choice: str | OpticsConfig[Any] | OpticalMode) -> OpticsConfig[Any]:
-    """Configuration of a name or of a built mode; a configuration is returned as it is.
-
-    Raises InputError: an unknown name, or an object of another kind.
-    """
+    """Configuration of a name or a built mode, or itself; InputError for anything else."""
     config = OPTICS.config(choice)  # type: ignore[arg-type]
     if isinstance(config, OpticsConfig):
         return config

@@ -36,10 +36,7 @@ class Response:
         self.black = np.asarray(spec.black_level, dtype=np.float32)
 
     def set_flat_field(self, background: np.ndarray, at_rest: np.ndarray) -> None:
-        """Turn radiance ``at_rest`` (H, W, 3) into the real ``background`` (uint8) from now on.
-
-        Raises InputError: a pixel that no light reaches at rest.
-        """
+        """Turn radiance ``at_rest`` (H, W, 3) into ``background`` (uint8); InputError where dark."""
         dark = int((at_rest <= 0).sum())
         if dark:
             rule = f"{dark} of {at_rest.size} values rendered at rest are dark, so no gain makes them bright"
@@ -103,10 +100,7 @@ def saturated_share(rgb: np.ndarray) -> float:
 
 
 def shading_gain(shading: Sequence[Sequence[float]], resolution: tuple[int, int]) -> np.ndarray:
-    """Gain (H, W, C) at ``resolution`` (width, height) by the coefficients of C channels.
-
-    They are as ``ResponseSpec.shading_red``; none is a gain of 1.
-    """
+    """Gain (H, W, C) at ``resolution`` by coefficients of C channels; none is a gain of 1."""
     x, y = (_centres(n) for n in resolution)
     return np.exp(np.stack([chebyshev.chebgrid2d(x, y, _table(c)).T for c in shading], -1))
 

@@ -1,7 +1,4 @@
-"""Interface of every physics of the gel.
-
-A configuration builds the pad of a press; a reading is the state of a pad at one instant.
-"""
+"""Interface of every physics of the gel: a configuration builds a pad, which gives readings."""
 
 from __future__ import annotations
 

@@ -148,10 +148,7 @@ class PressTargets:
         return SpecError(kept + error.rule, file=self._scene.source, key=f"trajectory[{index}].{name}", value=value)
 
     def _own(self, b: int, kinds: Iterable[str]) -> tuple[str, object] | None:
-        """Name and value of the target that took environment ``b`` where it is.
-
-        In stages of ``kinds``, last first, then at the start.
-        """
+        """Name and value of the target that put environment ``b`` where it is, last stage first."""
         for kind in kinds:
             values = self._own_targets.get(kind)
             if values is not None:

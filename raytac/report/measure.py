@@ -19,10 +19,7 @@ from raytac.io.metrics import Metric
 
 
 def moving(surfaces: Sequence[GelSurface], batch: int, count: int) -> list[GelSurface]:
-    """``count`` batches of ``surfaces`` (B = 1) in turn, at 70 to 100 % of their indentation.
-
-    No two frames are alike, so that nothing is measured that a cache of the last frame would save.
-    """
+    """``count`` batches of ``surfaces`` (B = 1), no two alike, at 70 to 100 % of indentation."""
     batches = []
     for k in range(count):
         picks = [surfaces[(k * batch + b) % len(surfaces)] for b in range(batch)]

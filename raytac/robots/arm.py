@@ -108,10 +108,7 @@ class Arm:
         return data.qfrc_bias[self.dof]
 
     def drive(self, data: mujoco.MjData, torque: np.ndarray) -> None:
-        """Command the motors to give ``torque`` (n,) [N·m]; they saturate at ``torque_limit``.
-
-        Raises ``InputError`` if a joint has no torque motor or a torque is not finite.
-        """
+        """Command ``torque`` (n,) [N·m] within limits; ``InputError`` without motors, or not finite."""
         self.check_motors()
         if np.shape(torque) != (len(self),) or not np.isfinite(torque).all():
             raise InputError("torque", value=np.asarray(torque).tolist(), rule=f"must be {len(self)} finite numbers")

@@ -1,4 +1,4 @@
-"""Kernels of an arm's control over B environments: joint springs, inverse kinematics, poses."""
+"""Kernels of an arm's control over B environments: numbers of states, springs, poses, servos."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -13,6 +13,8 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
 _2 = wp.constant(wp.float64(2.0))
+_MANY = wp.constant(0x7FFFFFFF)
+"""Length of an array that is known by its address alone."""
 
 
 @wp.func
@@ -215,3 +217,44 @@ def servo_step(servo: Servo):
         moved = along(servo, env, i, 0) + posture_step(servo, env, i)
         servo.step[env, i] = wp.clamp(servo.joints[env, i] + moved / excess, servo.range[i, 0], servo.range[i, 1])
         servo.velocity[env, i] = along(servo, env, i, 1) / speed_excess
+
+
+@wp.struct
+class Entries:
+    """Places of numbers in B states, and in the result, as one structure, which launches faster."""
+
+    places: wp.array2d(dtype=wp.uint64)
+    """Addresses (B, members) of arrays of float64."""
+    member: wp.array(dtype=wp.int32)
+    """Of every entry; negative: the index itself is the number."""
+    index: wp.array(dtype=wp.int32)
+    start: wp.array(dtype=wp.int32)
+    stride: wp.array(dtype=wp.int32)
+    """With ``start``, place of the entry of environment b: start + stride b."""
+    values: wp.array(dtype=wp.float64)
+
+
+@wp.kernel
+def read_numbers(entries: Entries):
+    """Copy entries of the members of B states to ``values``."""
+    env = wp.tid()
+    for k in range(entries.index.shape[0]):
+        value = wp.float64(entries.index[k])
+        if entries.member[k] >= 0:
+            place = entries.places[env, entries.member[k]]
+            value = wp.array(ptr=place, shape=(_MANY,), dtype=wp.float64)[entries.index[k]]
+        entries.values[entries.start[k] + env * entries.stride[k]] = value
+
+
+@wp.kernel
+def write_numbers(
+    places: wp.array(dtype=wp.uint64),
+    index: wp.array(dtype=wp.int32),
+    values: wp.array2d(dtype=wp.float64),
+    chosen: wp.array(dtype=wp.int32),
+):
+    """Copy ``values`` (B, n) to entries of the arrays at ``places`` (B,) where ``chosen``."""
+    env, k = wp.tid()
+    if chosen[env] != 0:
+        target = wp.array(ptr=places[env], shape=(_MANY,), dtype=wp.float64)
+        target[index[k]] = values[env, k]

@@ -140,10 +140,7 @@ class JointImpedance:
         return JointSprings(self.arm, datas, frequency=self._frequency, damping_ratio=self._ratio, others=others)
 
     def torque(self, data: mujoco.MjData, joints: np.ndarray, velocity: np.ndarray | None = None) -> JointTorque:
-        """Torques towards ``joints`` (n,) [rad] that move with ``velocity`` [rad/s]; None: 0.
-
-        Raises ``InputError`` for a wrong shape or a number that is not finite.
-        """
+        """Torques towards ``joints`` (n,) [rad] that move with ``velocity`` [rad/s]; None: 0."""
         rows = [None if value is None else np.asarray(value)[None] for value in (joints, velocity)]
         result = self.torques([data], rows[0], rows[1])  # type: ignore[arg-type]
         return JointTorque(result.torque[0], result.saturated[0])

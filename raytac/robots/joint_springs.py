@@ -24,10 +24,7 @@ class JointSprings:
     def __init__(
         self, arm: Arm, datas: Sequence[mujoco.MjData], *, frequency: float, damping_ratio: float, others: Sequence[int] = ()
     ) -> None:
-        """Springs of ``frequency`` [rad/s] and ``damping_ratio`` that hold no target yet.
-
-        ``others``: actuators that are commanded beside the arm's motors.
-        """
+        """Springs of ``frequency`` [rad/s], without target; ``others``: actuators beside the motors."""
         self.arm, self._datas = arm, tuple(datas)
         count, n = len(self._datas), len(arm)
         self._reader = StateReader(self._datas, {name: one for name, one in arm.numbers().items() if name in _READ})
@@ -52,10 +49,7 @@ class JointSprings:
         return self._reader.reads(datas)
 
     def aim(self, joints: np.ndarray, speed: np.ndarray, start: np.ndarray, others: np.ndarray | float = 0.0) -> None:
-        """Set targets ``joints`` (B, n) at times ``start`` (B,) [s], moving with ``speed`` (B, n).
-
-        ``others`` (B, k): controls of the other actuators.
-        """
+        """Aim at ``joints`` (B, n) from ``start`` [s] at ``speed``; ``others`` (B, k): controls."""
         self._target[:], self._speed[:], self._start[:], self._others[:] = joints, speed, start, others
 
     def torque(self) -> np.ndarray:
@@ -64,10 +58,7 @@ class JointSprings:
         return self._torque
 
     def drive(self, envs: Sequence[int] | np.ndarray) -> None:
-        """Command the motors of environments, and the other actuators.
-
-        Raises ``InputError`` if a joint has no torque motor or a control is not finite; nothing is written then.
-        """
+        """Command motors and others of environments, or raise ``InputError`` and write nothing."""
         if self._writer is None:
             self.arm.check_motors()
             return

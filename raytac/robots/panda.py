@@ -1,7 +1,4 @@
-"""The Franka Panda, our model or the menagerie's, with tactile sensors on it.
-
-Kinematics, limits and inertias with their sources: docs/robots.md and the comments of ``scenes/robots/panda.xml``.
-"""
+"""The Franka Panda, ours or the menagerie's, with tactile sensors; sources: docs/robots.md."""
 
 from __future__ import annotations
 

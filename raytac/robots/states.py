@@ -16,8 +16,8 @@ import numpy as np
 import warp as wp
 
 from raytac.errors import InputError
+from raytac.robots.arm_kernels import Entries, read_numbers, write_numbers
 from raytac.robots.mujoco_memory import checked_layouts, same_states
-from raytac.robots.state_kernels import Entries, read_numbers, write_numbers
 from raytac.warp_runtime import Recorded, start_warp
 
 _CONSTANT = -1
@@ -73,10 +73,7 @@ class StateReader:
     """
 
     def __init__(self, datas: Sequence[mujoco.MjData], members: Mapping[str, Numbers]) -> None:
-        """Look up where ``members`` of ``datas`` lie; nothing is read yet.
-
-        Raises ``InputError`` for what is no array of float64 of fixed size, or for an index beyond it.
-        """
+        """Look up where ``members`` of ``datas`` lie; InputError for no float64 of fixed size."""
         start_warp()
         self._datas = tuple(datas)
         for one in members.values():

@@ -22,10 +22,7 @@ _ROOT_STEPS = 100
 
 
 def line_in_part(pose: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Vertical lines in the part frame: o as three (…, Ny, Nx), d as three (…, 1, 1).
-
-    Point o + t d; d is common to all lines. ``pose``: (…, 4, 4).
-    """
+    """Vertical lines o + t d in the part frame: o three (…, Ny, Nx), d three (…, 1, 1)."""
     dx, dy = x - _entry(pose, 0, 3), y - _entry(pose, 1, 3)
     return [_entry(pose, 0, k) * dx + _entry(pose, 1, k) * dy for k in range(3)], [_entry(pose, 2, k) for k in range(3)]
 

@@ -1,7 +1,4 @@
-"""A scene in the browser: ``raytac view SCENE`` (docs/viewer.md). Needs ``raytac[view]``.
-
-The page has a 3-D view, tactile images and sliders.
-"""
+"""A scene in the browser: ``raytac view SCENE`` (docs/viewer.md); needs ``raytac[view]``."""
 
 import lazy_loader
 

@@ -83,8 +83,6 @@ class Page:
             if self._last is not None:
                 self._place_sliders(self._last)
 
-    # --- building --------------------------------------------------------------------------------------------------------------
-
     def _build_main(self) -> None:
         gui = self._server.gui
         gui.set_panel_label("raytac view")
@@ -148,8 +146,6 @@ class Page:
     def _look_at(self, event: GuiEvent[Any]) -> None:
         if event.client is not None and self._last is not None:
             self._view.look(event.client, self._last.pads.get(event.target.value))
-
-    # --- drawing ---------------------------------------------------------------------------------------------------------------
 
     def _redraw(self) -> None:
         with self._drawing, self._server.atomic():

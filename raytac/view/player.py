@@ -106,8 +106,6 @@ class Player:
             self._orders.append(order)
             self._wakeup.notify()
 
-    # --- the thread ------------------------------------------------------------------------------------------------------------
-
     def _work(self) -> None:
         while True:
             with self._wakeup:

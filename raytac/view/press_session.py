@@ -82,8 +82,6 @@ class PressSession:
         self._states: Iterator[PadReading] = iter(())
         self.reset()
 
-    # --- what a player asks ----------------------------------------------------------------------------------------------------
-
     def reset(self) -> None:
         self._targets = {}
         self.controls: tuple[Control, ...] = self._own_controls
@@ -127,8 +125,6 @@ class PressSession:
             self._shot = self._drawn(self._sensor.update(self._state))
         return self._shot
 
-    # --- controls --------------------------------------------------------------------------------------------------------------
-
     def _make_controls(self, scene: PressScene) -> tuple[Control, ...]:
         thickness = 1e3 * self._sensor.spec.gelpad.thickness
         deepest = max([_DEEPEST * thickness, *(1e3 * (stage.depth or 0.0) for stage in scene.trajectory)])
@@ -170,8 +166,6 @@ class PressSession:
             "shear_y": float(y),
             "twist": float(np.degrees(np.arctan2(turned[1, 0], turned[0, 0]))),
         }
-
-    # --- drawing ---------------------------------------------------------------------------------------------------------------
 
     def _object_solids(self) -> tuple[Solid, ...]:
         if not self._pad.parts:

@@ -65,8 +65,6 @@ class WorldSession:
         self._physics_ms = 0.0
         self._shot: Snapshot | None = None
 
-    # --- what a player asks ----------------------------------------------------------------------------------------------------
-
     def reset(self) -> None:
         self._state = self._world.reset()
         self._steering.reset()
@@ -94,8 +92,6 @@ class WorldSession:
         if self._shot is None:
             self._shot = self._drawn(self._world.observe())
         return self._shot
-
-    # --- drawing ---------------------------------------------------------------------------------------------------------------
 
     def _geoms(self) -> Iterator[Solid]:
         model = self._world.model

@@ -89,10 +89,7 @@ def save_mlp(weights: MlpWeights, path: Path) -> None:
 
 
 def load_mlp(path: str | Path) -> MlpWeights:
-    """A network that ``save_mlp`` wrote: its file, or the folder of ``raytac calibrate``.
-
-    Raises CalibrationError for a file that is missing, damaged, of another version, or holds other arrays.
-    """
+    """A network of ``save_mlp``: its file, or the folder that holds it; else CalibrationError."""
     path = Path(path)
     path = path / "mlp.npz" if path.is_dir() else path
     if not path.is_file():

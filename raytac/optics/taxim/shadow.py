@@ -87,7 +87,7 @@ class ShadowCaster:
         return packed, np.stack(counts)
 
     def cast(self, seen: ImageHeights, of: Any, direction: Any, change: list[Any], arrays: ShadowArrays) -> list[Any]:
-        """``change`` (3 × B·H·W levels), shadowed, blurred; ``of`` [px], slope's ``direction`` [rad]."""
+        """``change`` (3 × B·H·W), shadowed and blurred; ``of`` [px], slope's ``direction`` [rad]."""
         mi, t = self.mi, self.table
         width, height = self.resolution
         _, n_dir, n_depth, length = t.values.shape

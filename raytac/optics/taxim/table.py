@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from raytac.checks import check_known
 from raytac.errors import InputError
 
 SLOPES_OF = ("height", "displacement")
@@ -98,8 +99,7 @@ class ShadowTable:
         for name in ("depth_precision", "direction_precision", "step", "fan_angle", "fan_precision"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise InputError(f"shadow.{name}", value=getattr(self, name), rule="must be finite and > 0")
-        if self.depth_of not in DEPTHS_OF:
-            raise InputError("shadow.depth_of", value=self.depth_of, rule="must be a known depth", choices=DEPTHS_OF)
+        check_known("shadow.depth_of", self.depth_of, DEPTHS_OF)
         if self.fan_angle > 32 * self.fan_precision:
             raise InputError("shadow.fan_precision", value=self.fan_precision, rule="must make a fan of at most 64 rays")
 
@@ -177,8 +177,7 @@ class PolyTable:
                 raise InputError(name, value=array.shape, rule=f"must have the background's shape {expected}")
         if len(self.pixel_pitch) != 2 or not all(np.isfinite(p) and p > 0 for p in self.pixel_pitch):
             raise InputError("pixel_pitch", value=self.pixel_pitch, rule="must be (x, y), finite and > 0 [m]")
-        if self.slopes_of not in SLOPES_OF:
-            raise InputError("slopes_of", value=self.slopes_of, rule="must be a known surface", choices=SLOPES_OF)
+        check_known("slopes_of", self.slopes_of, SLOPES_OF)
 
     @property
     def n_bins(self) -> int:

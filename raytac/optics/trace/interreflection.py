@@ -105,10 +105,7 @@ def patches_of(layout: CoatLayout) -> NodeGrid:
 
 
 def patches_in_view(g: NodeGrid, camera: Pinhole, thickness: float) -> tuple[int, int, int, int]:
-    """First column, first row, columns and rows of the patches that a camera sees of a gel.
-
-    It is as thick [m] at most as at rest and a bulge.
-    """
+    """First column, first row, columns, rows of patches in view of gel as thick [m] at most."""
     left, top, width, height = camera.piece
     u, v = np.meshgrid(np.linspace(left, left + width, _RAYS), np.linspace(top, top + height, _RAYS))
     origin, slope = camera.ray(u, v)
@@ -142,10 +139,7 @@ class BounceField:
     def build(
         cls, mi: Any, layout: CoatLayout, case: CaseLight, camera: Pinhole, thickness: float, lit: Sequence[int]
     ) -> BounceField:
-        """Lay the grid over the pad and evaluate the case's light on it.
-
-        ``thickness`` of the gel [m]; ``lit``: channels that an LED gives light to.
-        """
+        """Lay the grid over a pad of ``thickness`` [m]; evaluate the case's light, channels ``lit``."""
         g = patches_of(layout)
         x, y = np.meshgrid(g.x0 + g.dx * np.arange(g.nx), g.y0 + g.dy * np.arange(g.ny))
         on_nodes = case.on(x.ravel(), y.ravel())
@@ -159,10 +153,7 @@ class BounceField:
         return 16 * len(lit) * columns * rows + g.nx * g.ny * (16 + 16 * -(-len(lit) // 4) + 4)
 
     def gather_light(self, mi: Any, field: CoatField, radiosity: Callable[[PixelSample], list[Any]], envs: Any) -> list[Any]:
-        """Packed (e, v_x, v_y, v_z) of the patches in view of ``field``, an array a lit channel.
-
-        ``radiosity``: B [radiance · sr] of every channel at a sample.
-        """
+        """(e, v_x, v_y, v_z) of the patches in view, an array a lit channel, by ``radiosity`` B."""
         g = self.patches
         i = dr.arange(mi.UInt32, envs * (g.nx * g.ny))
         env, ix, iy = i // (g.nx * g.ny), i % g.nx, (i // g.nx) % g.ny

@@ -21,10 +21,7 @@ LEAST_COSINE = 1e-6
 
 
 def lobe_gain(ops: Any, cos_theta: Any, exponent: Any, least: float = LEAST_COSINE) -> Any:
-    """cosⁿ θ of a lobe by ``ops``, NumPy or Dr.Jit; the caller leaves out what lies behind.
-
-    n is ``lobe`` for the intensity and ``lobe`` − 1 for the radiance.
-    """
+    """cosⁿ θ of a lobe in front, by ``ops``; n is ``lobe``, for the radiance ``lobe`` − 1."""
     return ops.power(ops.maximum(cos_theta, least), exponent)
 
 

@@ -130,10 +130,7 @@ assert abs(float(mi.Float(image.array)[0]) - 0.5) < 0.05, "a grey image does not
 
 
 def make_denoiser(mi: Any, device: str, resolution: tuple[int, int]) -> Callable[[np.ndarray], np.ndarray]:
-    """A function from a noisy linear image (H, W, 3) to a clean one, for one ``resolution``.
-
-    Raises BackendError: on the CPU without the package mitsuba-oidn; on CUDA where OptiX's denoiser does not work.
-    """
+    """Function that denoises a linear image of one ``resolution``; BackendError where none can."""
     if device == "cuda":
         if failure := _optix_failure():
             raise BackendError(

@@ -276,10 +276,7 @@ class SceneRegistry:
         return {name: poses[name].copy() for name, body in self.bodies.items() if body.is_driven}
 
     def friction(self) -> dict[tuple[str, str], float]:
-        """μ by pair of names.
-
-        With a pad, the body's own if it has one, else the pad's gel's; between bodies, the larger of theirs.
-        """
+        """μ by pair of names: a body's own, else the pad's, on a pad; the larger between bodies."""
         mu = {}
         for pad in self.pads.values():
             gel = pad.sensor.gelpad.friction

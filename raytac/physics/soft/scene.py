@@ -257,10 +257,7 @@ class SoftScene:
         return make_grid(self._registry.pad(pad).sensor.gelpad, self._registry.pad(pad).pitch)
 
     def reading(self, pad: str, grid: PadGrid | None = None, failed: np.ndarray | None = None) -> SoftReading:
-        """Surface, contact and forces of a pad, on its own grid or another; NaN where failed.
-
-        ``failed``: mask (B,) of environments that failed elsewhere.
-        """
+        """Surface, contact, forces of a pad on its own grid or another; NaN where ``failed`` (B,)."""
         scene_pad = self._registry.pad(pad)
         if pad not in self._readers or (grid is not None and grid is not self._readers[pad].grid):
             mesh = replace(scene_pad.mesh, d_hat=self.world.d_hat)

@@ -6,7 +6,7 @@ import importlib.util
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from raytac.checks import check_seed
+from raytac.checks import check_known, check_seed
 from raytac.errors import BackendError, InputError
 from raytac.markers.base import marker_motion_of
 from raytac.report.image_error import SSIM_BORDER
@@ -66,8 +66,8 @@ class CompareSettings:
         ):
             if value < lowest:
                 raise InputError(name, value=value, rule=f"must be at least {lowest}")
-        if self.pad is not None and self.pad not in PADS:
-            raise InputError("pad", value=self.pad, rule="must be a known level", choices=PADS)
+        if self.pad is not None:
+            check_known("pad", self.pad, PADS)
         if not self.budget_s > 0:
             raise InputError("budget_s", value=self.budget_s, rule="must be > 0 [s]")
         check_seed("seed", self.seed)

@@ -39,10 +39,7 @@ class BinFit:
 
 
 class BinSums:
-    """Normal equations of all slope bins.
-
-    The last direction bin (exactly π) is one with the bin before it, since no more than rounding tells them apart.
-    """
+    """Normal equations of all slope bins; the last direction (exactly π) goes to the one before."""
 
     def __init__(self, n_bins: int, resolution: tuple[int, int]) -> None:
         self.n_bins, self.resolution = n_bins, resolution

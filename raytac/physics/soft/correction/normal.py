@@ -221,10 +221,7 @@ class _Window:
 
 
 def _smoothing(lines: np.ndarray) -> np.ndarray:
-    """Filter (n, n) that removes waves of two cells on ``lines`` (n,) and keeps straight slopes.
-
-    A wave of λ even cells keeps the share cos²(π/λ): half at four cells, 0.85 at eight.
-    """
+    """Filter (n, n) on ``lines`` (n,): waves of λ even cells keep cos²(π/λ), 0 of two cells."""
     cell, n = np.diff(lines), len(lines)
     out = np.eye(n)
     for i in range(1, n - 1):

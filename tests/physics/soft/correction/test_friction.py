@@ -12,11 +12,16 @@ import pytest
 from raytac.gel.surface import make_grid
 from raytac.physics.bonded_layer import layer_shear
 from raytac.physics.soft.coat_surface import CoatSurface
-from raytac.physics.soft.correction import friction
-from raytac.physics.soft.correction.friction import FrictionCorrection, PlaneMotion, plane_displacement
+from raytac.physics.soft.correction import tangential
 from raytac.physics.soft.correction.mesh_compliance import coat_compliance
 from raytac.physics.soft.correction.normal import NormalCorrection
-from raytac.physics.soft.correction.tangential import TangentialCorrection, _share
+from raytac.physics.soft.correction.tangential import (
+    FrictionCorrection,
+    PlaneMotion,
+    TangentialCorrection,
+    _share,
+    plane_displacement,
+)
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
 from raytac.specs import load_sensor
 
@@ -242,7 +247,7 @@ def test_a_contact_at_the_pads_border_is_exchanged_too(contact, stage, corner, m
 
 def test_a_contact_that_nothing_moves_is_left_alone(contact, stage, monkeypatch):
     monkeypatch.setattr(
-        friction, "plane_displacement", lambda waves, lines: np.zeros((2, len(lines[1][0]), lines[0][0].shape[1]))
+        tangential, "plane_displacement", lambda waves, lines: np.zeros((2, len(lines[1][0]), lines[0][0].shape[1]))
     )
     assert stage.solve(dome(contact[0]), motion(1e-4), 0.6) is None
 
