@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from threading import RLock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,6 +40,8 @@ _ASK = {
     "unconverged": "is of soft pads alone: physics='ipc'",
 }
 """Advice on asking for an array that ``outputs=`` does not list by its own name."""
+_WAITING = RLock()
+"""Held while images are waited for, so that two readers of a frame do not both render."""
 
 
 @dataclass(frozen=True, repr=False, eq=False, init=False)
@@ -103,7 +106,7 @@ class TactileFrame:
     time_ms: dict[str, float]
     """Wall time of ``physics``, ``surface``, ``markers``, ``optics`` for the batch [ms].
 
-    ``optics`` is the time to launch the images and, once one was read, the wait for them."""
+    ``optics`` is the time to launch the images and, once one was read, the wait for them; the dictionary is another one then."""
 
     label: str
     """Physics and optics that it came from, as ``TactileSensor.label``; empty if unknown."""
@@ -135,14 +138,17 @@ class TactileFrame:
 
     def _wait(self) -> None:
         """Wait for the images, if nobody has."""
-        images = self.__dict__.get("_images")
-        if images is None:
+        if "_images" not in self.__dict__:
             return
-        began = time.perf_counter()
-        given = {name: value for name, value in images().items() if value is not None}
-        waited = 1e3 * (time.perf_counter() - began)
-        self.__dict__.update(given, time_ms={**self.time_ms, "optics": self.time_ms.get("optics", 0.0) + waited})
-        self.__dict__.pop("_images", None)
+        with _WAITING:
+            images = self.__dict__.get("_images")
+            if images is None:  # another thread has waited
+                return
+            began = time.perf_counter()
+            given = {name: value for name, value in images().items() if value is not None}
+            waited = 1e3 * (time.perf_counter() - began)
+            self.__dict__.update(given, time_ms={**self.time_ms, "optics": self.time_ms.get("optics", 0.0) + waited})
+            self.__dict__.pop("_images", None)
 
     def __getstate__(self) -> dict[str, Any]:
         self._wait()

@@ -11,7 +11,7 @@ from raytac.checks import check_methods
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.device_mode import Float, UInt8, upload
-from raytac.optics.runtime import no_collection
+from raytac.optics.runtime import RENDERER, no_collection
 
 
 @dataclass(frozen=True)
@@ -77,20 +77,21 @@ class DeviceImage:
 
         Raises InputError: no whole number of grids, or contact missing.
         """
-        mi = self.mi
-        heights, contact = (self._array(v, t) for v, t in ((heights, mi.Float), (contact, mi.UInt8)))
-        image = self._mode.render_device(heights, contact).rgb
-        envs = dr.width(heights) // self._nodes
-        if not self._is_whole or self._rest is not None:
-            if envs not in self._frozen:
-                self._frozen[envs] = dr.freeze(lambda image, rest: self._kept(image, envs, rest))
-            with no_collection():
-                image = self._frozen[envs](image, self._rest)
-        width, height = self._cut.size
-        dr.eval(image)
-        dr.sync_thread()  # another library's stream does not wait for this one's
-        tensor: Any = dr.tensor_t(type(image))
-        return tensor(image, (envs, height, width, 3))
+        with RENDERER:
+            mi = self.mi
+            heights, contact = (self._array(v, t) for v, t in ((heights, mi.Float), (contact, mi.UInt8)))
+            image = self._mode.render_device(heights, contact).rgb
+            envs = dr.width(heights) // self._nodes
+            if not self._is_whole or self._rest is not None:
+                if envs not in self._frozen:
+                    self._frozen[envs] = dr.freeze(lambda image, rest: self._kept(image, envs, rest))
+                with no_collection():
+                    image = self._frozen[envs](image, self._rest)
+            width, height = self._cut.size
+            dr.eval(image)
+            dr.sync_thread()  # another library's stream does not wait for this one's
+            tensor: Any = dr.tensor_t(type(image))
+            return tensor(image, (envs, height, width, 3))
 
     @staticmethod
     def _array(values: Any, kind: Any) -> Any:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
+from weakref import ref
 
 import drjit as dr
 import numpy as np
@@ -21,7 +22,7 @@ from raytac.optics.camera import Pinhole
 from raytac.optics.geometry import CoatField, CoatLayout, check_view, see, seen_images
 from raytac.optics.ink import checked_ink
 from raytac.optics.refraction import Slab
-from raytac.optics.runtime import load_mitsuba, no_collection
+from raytac.optics.runtime import RENDERER, load_mitsuba, no_collection
 from raytac.specs.sensor import SensorSpec
 
 Float = Any  # Dr.Jit array of float32
@@ -99,8 +100,8 @@ class DeviceMode(ABC):
         self._frozen: dict[tuple[str, bool, int], Callable[..., Any]] = {}
         self._at_rest: OpticsImages | None = None
         """Images of one untouched pad, which every environment at rest shows."""
-        self._is_running = False
-        """True if nobody has waited for the images that were begun last."""
+        self._is_running, self._last = False, _nothing
+        """Whether nobody has waited for the images that were begun last, and these."""
         self._set_up()
 
     def _set_up(self) -> None:  # noqa: B027 (a mode may need nothing more)
@@ -201,40 +202,47 @@ class DeviceMode(ABC):
     def start(self, surface: GelSurface) -> Callable[[], OpticsImages]:
         """Begin ``render``; returns a function that waits for the images and copies them back.
 
-        Dr.Jit computes them beside what the caller does next. At most one call is under way: the next one waits for it. Dr.Jit lets
-        only the thread that launched a kernel wait for it, so in another thread the function renders the surface again.
-        The arrays of ``surface`` may be written to at once: the images are those of its values at the call.
+        Dr.Jit computes them beside what the caller does next. At most one call is under way: the next one waits for it, and copies its
+        images back if they may still be asked for, so that no more than one batch is on the device. Dr.Jit lets only the thread that
+        launched a kernel wait for it: in another thread the function renders the surface again. The arrays of ``surface`` may be written
+        to at once: the images are those of its values at the call.
 
         Raises the same as ``render``.
         """
-        if self._is_running:
-            dr.sync_thread()
-        # Copies: on the CPU Dr.Jit reads NumPy memory in place, when the kernel runs.
-        ink = None if surface.ink is None else surface.ink.copy()
-        surface = replace(surface, height=surface.height.copy(), contact=surface.contact.copy(), ink=ink)
-        heights, failed = self._checked(surface)
-        pressed = self._pressed(surface, heights, failed)
-        whole = len(pressed) == surface.batch
-        if not whole and self._at_rest is None:
-            rest = GelSurface.at_rest(surface.grid)
-            self._at_rest = self._begun(rest, rest.height, np.zeros(1, bool))()
-        begun = None
-        if pressed:
-            rows = (surface, heights, failed) if whole else (surface.rows(pressed), heights[pressed], failed[pressed])
-            begun, self._is_running = self._begun(*rows), True
-        caller = threading.get_ident()
+        with RENDERER:
+            self._finish()
+            # Copies: on the CPU Dr.Jit reads NumPy memory in place, when the kernel runs.
+            ink = None if surface.ink is None else surface.ink.copy()
+            surface = replace(surface, height=surface.height.copy(), contact=surface.contact.copy(), ink=ink)
+            heights, failed = self._checked(surface)
+            pressed = self._pressed(surface, heights, failed)
+            whole = len(pressed) == surface.batch
+            if not whole and self._at_rest is None:
+                rest = GelSurface.at_rest(surface.grid)
+                self._at_rest = self._begun(rest, rest.height, np.zeros(1, bool))()
+            begun = None
+            if pressed:
+                rows = (surface, heights, failed) if whole else (surface.rows(pressed), heights[pressed], failed[pressed])
+                begun = self._begun(*rows)
 
         def images() -> OpticsImages:
-            if threading.get_ident() != caller:
-                return self.render(surface)
-            self._is_running = False
             some = None if begun is None else begun()
             if whole and some is not None:
                 return some
             assert self._at_rest is not None
             return _spread(self._at_rest, some, pressed, surface.batch)
 
-        return images
+        result = _Launched(images, partial(self.render, surface))
+        self._last, self._is_running = ref(result), begun is not None
+        return result
+
+    def _finish(self) -> None:
+        """Wait for the call that is under way, if there is one; its images are copied back if anybody may ask for them."""
+        if not self._is_running:
+            return
+        last, self._is_running = self._last(), False
+        if last is None or not last.keep():
+            dr.sync_thread()
 
     def _pressed(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> list[int]:
         """Environments to render: a power of two, the others are at rest; all if dots may differ."""
@@ -271,7 +279,8 @@ class DeviceMode(ABC):
             raise InputError("heights", value=type(heights).__name__, rule="call prepare(grid) first: it tells the grid")
         others = ({"contact": contact} if self.needs_contact else {}) | ({} if ink is None else {"ink": ink})
         self._check_batch(device_envs(self.layout.nx * self.layout.ny, heights, **others), self._grid)
-        return DeviceFrame(*self._recorded(self._frame, heights, contact if self.needs_contact else None, ink))
+        with RENDERER:
+            return DeviceFrame(*self._recorded(self._frame, heights, contact if self.needs_contact else None, ink))
 
     def _images(
         self, surface: GelSurface, failed: np.ndarray, lit: DeviceFrame | dict[str, Any] | None, seen: tuple[Any, Any] | None
@@ -347,6 +356,33 @@ class DeviceMode(ABC):
     def _upload_ink(self, surface: GelSurface) -> Float | None:
         ink = checked_ink(surface)
         return None if ink is None else self._upload(ink)
+
+
+class _Launched:
+    """Images that one thread has launched, waited for and copied back once; another thread renders them again."""
+
+    def __init__(self, wait: Callable[[], OpticsImages], again: Callable[[], OpticsImages]) -> None:
+        self._wait, self._again, self._caller = wait, again, threading.get_ident()
+        self._images: OpticsImages | None = None
+
+    def keep(self) -> bool:
+        """Wait for the images and copy them back; False in a thread that did not launch them."""
+        with RENDERER:
+            if self._images is None and threading.get_ident() == self._caller:
+                self._images = self._wait()
+                del self._wait  # with the arrays on the device
+            return self._images is not None
+
+    def __call__(self) -> OpticsImages:
+        with RENDERER:
+            if not self.keep():
+                self._images = self._again()
+            assert self._images is not None
+            return self._images
+
+
+def _nothing() -> None:
+    """Reference to no images."""
 
 
 def _spread(rest: OpticsImages, images: OpticsImages | None, envs: list[int], batch: int) -> OpticsImages:

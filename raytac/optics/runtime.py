@@ -6,6 +6,7 @@ import gc
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from threading import RLock
 from typing import Any
 
 import drjit as dr
@@ -91,6 +92,10 @@ def _require_llvm() -> None:
             "`pip install karellen-llvm-core`, or set DRJIT_LIBLLVM_PATH to a libLLVM of version 16 or newer; "
             "`raytac doctor` tells what was tried"
         )
+
+
+RENDERER = RLock()
+"""Held by whoever records, launches or waits for kernels: Dr.Jit keeps what it records in one place of the process."""
 
 
 @contextmanager

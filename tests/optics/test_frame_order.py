@@ -6,6 +6,8 @@ Dr.Jit records the kernels of a first frame and replays them for the next, so a 
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -364,6 +366,42 @@ def test_another_thread_reads_the_same_images(mode: str) -> None:
     assert len(read) == 5
     for images in read:
         assert_same(images, expected, "read in another thread")
+
+
+_POOL = """
+from concurrent.futures import ThreadPoolExecutor
+import numpy as np
+import raytac
+
+sensor = raytac.TactileSensor("gelsight_mini", optics="raytrace", resolution=(64, 48), pitch=0.4e-3, device="cpu")
+first = sensor.press("sphere")
+expected, surface = first.rgb.copy(), first.surface
+with ThreadPoolExecutor(1) as pool:
+    read = [pool.submit(lambda frame: np.array_equal(frame.rgb, expected), sensor.update(surface)) for _ in range(60)]
+assert all(one.result() for one in read)
+print("right")
+"""
+
+
+def test_frames_are_read_in_a_thread_while_others_are_launched() -> None:
+    """In a process of its own: Dr.Jit ends one in which two threads record at a time."""
+    ended = subprocess.run([sys.executable, "-c", _POOL], capture_output=True, text=True, check=False)
+    assert ended.returncode == 0 and ended.stdout.strip() == "right", ended.stderr[-2000:]
+
+
+def test_one_batch_alone_is_on_the_device() -> None:
+    """The next call copies the images of the last one back, and nobody's images are computed twice."""
+    one = MODES["phong"]("cpu")
+    expected = by_name(one.render(stacked(PRESS)))
+    first: Any = one.start(stacked(PRESS))
+    assert first._images is None
+    second: Any = one.start(stacked(PRESS))
+    assert first._images is not None and second._images is None
+    assert first() is first() and by_name(first()).keys() == expected.keys()
+    third: Any = one.start(stacked(PRESS))
+    assert second._images is not None and third._images is None
+    for images in (first(), second(), third()):
+        assert_same(by_name(images), expected, "read late")
 
 
 @EACH_MODE
