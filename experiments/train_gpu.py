@@ -288,7 +288,7 @@ class Training:
         progress = {"settings": self.settings, "steps": self.steps, "iteration": self.iteration, "wall_s": self.wall_s}
         for name, values in (
             ("checkpoint", self.ppo.save()),
-            ("policy", {"actor_state_dict": self.ppo.get_policy().state_dict()}),
+            ("policy", {"actor_state_dict": {name: one.cpu() for name, one in self.ppo.get_policy().state_dict().items()}}),
         ):
             stream = io.BytesIO()
             torch.save({**progress, **values}, stream)

@@ -81,12 +81,14 @@ class WarpBatch:
         launches: int | None = None,
         contacts: int | None = None,
         rows: int | None = None,
+        patches: int = 8,
     ) -> None:
         """Make the worlds; ``reset`` begins the episodes.
 
         Args:
             task, num_envs, tactile, body_seen, max_episode_steps, seed, scene, pitch: as of ``TaskBatch``.
             device, launches, contacts, rows: as of ``WarpWorld``.
+            patches: most separate contacts of a pad, for its markers; more are an error of ``check``.
 
         Raises:
             InputError: a value out of its choices; as ``WarpWorld`` and ``WarpTouch``.
@@ -99,7 +101,7 @@ class WarpBatch:
         self.world = world = WarpWorld(
             loaded, num_envs=num_envs, device=device, frequency=frequency, launches=launches, contacts=contacts, rows=rows
         )
-        self.touch = None if settings is None else WarpTouch(world, settings, pitch=pitch, seed=seed)
+        self.touch = None if settings is None else WarpTouch(world, settings, pitch=pitch, patches=patches, seed=seed)
         self.device = torch.device(wp.device_to_torch(world.engine.device))
         self.body_seen = task.body_seen if body_seen is None else body_seen
         self._names = [mounted.name for mounted in world.composed.sensors]

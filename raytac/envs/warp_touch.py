@@ -26,13 +26,16 @@ class WarpTouch:
         pads: surfaces and markers of every sensor by its name; empty where the wrench alone is observed.
     """
 
-    def __init__(self, world: WarpWorld, settings: ObservationSettings, *, pitch: float | None = None, seed: int = 0) -> None:
+    def __init__(
+        self, world: WarpWorld, settings: ObservationSettings, *, pitch: float | None = None, patches: int = 8, seed: int = 0
+    ) -> None:
         """Make the arrays.
 
         Args:
             world: after a reset.
             settings: of the observation.
             pitch: spacing of the pads' grids [m]; None is that of ``TaskBatch``.
+            patches: most separate contacts of a pad, for its markers.
             seed: of the markers.
 
         Raises:
@@ -67,7 +70,7 @@ class WarpTouch:
                 grid = sensor.grid
                 self._images[mounted.name] = DeviceImages(observer, sensor)
             self.pads[mounted.name] = pad = PadTouch(
-                mounted.spec, grid, bodies, observer.markers, num_envs=count, device=str(device), pad=k
+                mounted.spec, grid, bodies, observer.markers, num_envs=count, patches=patches, device=str(device), pad=k
             )
             if pad.fots is not None:
                 self._markers[mounted.name] = wp.to_torch(pad.fots.displacement)

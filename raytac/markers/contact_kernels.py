@@ -1,4 +1,4 @@
-"""Kernels of ``DeviceContacts``: cells, connected contacts and their history, as ``ContactCells`` and ``ContactTracker`` have them."""
+"""Kernels of ``DeviceFots``: cells, connected contacts and their history, as ``ContactCells`` and ``ContactTracker`` have them."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false

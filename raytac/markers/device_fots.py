@@ -30,7 +30,7 @@ class DeviceFots:
     """
 
     def __init__(
-        self, sensor: SensorSpec, config: MarkersConfig, grid: PadGrid, *, num_envs: int, contacts: int = 8, device: str = "cpu"
+        self, sensor: SensorSpec, config: MarkersConfig, grid: PadGrid, *, num_envs: int, patches: int = 8, device: str = "cpu"
     ) -> None:
         """Make the arrays.
 
@@ -39,7 +39,7 @@ class DeviceFots:
             config: of the model.
             grid: nodes of the surfaces.
             num_envs: number of pads B.
-            contacts: most separate contacts of a pad.
+            patches: most separate contacts of a pad.
             device: "cpu" or "cuda".
 
         Raises:
@@ -64,7 +64,7 @@ class DeviceFots:
         self._pad = pad
         size: Any = fots_kernels.Cells()
         size.origin, size.pitch = wp.vec2f(cells.x[0], cells.y[0]), wp.vec2f(*cells.pitch)
-        self._cells, self._constants, self._room = size, _constants(motion, config), contacts
+        self._cells, self._constants, self._room = size, _constants(motion, config), patches
 
         def zeros(*shape: int, dtype: Any) -> wp.array:
             return wp.zeros((num_envs, *shape), dtype=dtype, device=self.device)
@@ -72,12 +72,12 @@ class DeviceFots:
         self._xy = wp.array(rest[:, :2], dtype=wp.vec2f, device=self.device)
         self._depth = zeros(len(cells.y), len(cells.x), dtype=wp.float32)
         self._parent, self._box = zeros(len(cells.y) * len(cells.x), dtype=wp.int32), zeros(dtype=wp.vec4i)
-        self._moments = zeros(contacts, dtype=contact_kernels.Moments)
-        self._contacts, self._before = (zeros(contacts, dtype=contact_kernels.Contact) for _ in range(2))
+        self._moments = zeros(patches, dtype=contact_kernels.Moments)
+        self._contacts, self._before = (zeros(patches, dtype=contact_kernels.Contact) for _ in range(2))
         self._pose, self._pressed = zeros(dtype=wp.mat44d), zeros(dtype=wp.int32)
         self._pose.fill_(_NAN)
         self._pressed.fill_(-1)
-        self._table, self._drags = zeros(contacts, _COLUMNS, dtype=wp.float32), zeros(contacts, dtype=fots_kernels.Drag)
+        self._table, self._drags = zeros(patches, _COLUMNS, dtype=wp.float32), zeros(patches, dtype=fots_kernels.Drag)
         self._most = wp.zeros(1, dtype=wp.int32, device=self.device)
         self.displacement = zeros(len(rest), dtype=wp.vec2f)
 
@@ -90,7 +90,7 @@ class DeviceFots:
             height, contact: as of ``DeviceSurround``.
             poses: ``pad_from_body`` (B, pads, bodies + …); ``pad``: index of this one.
             depths: overlap of each body with the pad (B, bodies) [m]; the deepest is the object.
-            sound: environments that have not broken down, (B,), bool; the others keep their history.
+            sound: environments that have not broken down, (B,), bool; of the others it is kept which body was the object.
             shear: of the gels, the structure of a ``ShearState``.
         """
         pool = [height, contact, self._pad, self._depth]
@@ -112,7 +112,8 @@ class DeviceFots:
         """Wait for the device. Raises ``InputError`` if a pad had more contacts than there is memory for."""
         most = int(self._most.numpy()[0])
         if most > self._room:
-            raise InputError("contacts", value=self._room, rule=f"must be {most} or more: contacts of a pad were lost")
+            self._most.zero_()
+            raise InputError("patches", value=self._room, rule=f"must be {most} or more: contacts of a pad were lost")
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)

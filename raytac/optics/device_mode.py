@@ -101,7 +101,7 @@ class DeviceMode(ABC):
         self._at_rest: OpticsImages | None = None
         """Images of one untouched pad, which every environment at rest shows."""
         self._is_running, self._last = False, _nothing
-        """Whether nobody has waited for the images that were begun last, and these."""
+        """True if nobody has waited for the images that were begun last, and a reference to these."""
         self._set_up()
 
     def _set_up(self) -> None:  # noqa: B027 (a mode may need nothing more)

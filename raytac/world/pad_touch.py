@@ -14,7 +14,7 @@ from raytac.physics.rigid.gel_contact import GelContact
 from raytac.physics.rigid.underside import Undersides
 from raytac.shapes.part import Part
 from raytac.specs.sensor import SensorSpec
-from raytac.world.start_kernels import copy_mask
+from raytac.world.start_kernels import copy_mask, lose_marked
 
 
 class PadTouch:
@@ -34,6 +34,7 @@ class PadTouch:
         *,
         pad: int,
         num_envs: int,
+        patches: int = 8,
         device: str = "cpu",
     ) -> None:
         """Make the arrays.
@@ -44,6 +45,7 @@ class PadTouch:
             markers: model of the markers; None is no markers.
             pad: index among the pads of the world.
             num_envs: number of environments B.
+            patches: most separate contacts of the pad, for its markers.
             device: "cpu" or "cuda".
 
         Raises ``InputError`` as ``DeviceFots``.
@@ -52,16 +54,22 @@ class PadTouch:
         self._pad, self._bodies = pad, len(bodies)
         self._undersides = Undersides(grid, thickness, bodies, num_envs=num_envs, device=device)
         self._surround = DeviceSurround(grid, thickness, num_envs=num_envs, device=device)
-        self.fots = None if markers is None else DeviceFots(spec, markers, grid, num_envs=num_envs, device=device)
+        self.fots = (
+            None if markers is None else DeviceFots(spec, markers, grid, num_envs=num_envs, patches=patches, device=device)
+        )
         self.height, self.contact = self._surround.height, self._surround.contact
 
     def launch(self, contact: GelContact, active: wp.array) -> None:
-        """Launch the kernels for the poses of ``contact.motion``; ``active`` (B,), bool: environments that have not broken down."""
+        """Launch the kernels for the poses of ``contact.motion``.
+
+        ``active`` (B,), bool: environments that have not broken down; one whose gel would lie below its bonded face is no longer.
+        """
         under, poses = self._undersides, contact.motion.pose
         wp.copy(under.poses, poses[:, self._pad, : self._bodies])
         wp.launch(copy_mask, dim=len(active), inputs=[active, under.sound], device=under.device)
         under.launch()
         self._surround.launch(under.height, under.deepest, active)
+        wp.launch(lose_marked, dim=len(active), inputs=[self._surround.pierced, active], device=under.device)
         if self.fots is not None:
             self.fots.launch(self.height, self.contact, poses, self._pad, under.deepest, active, contact.shear.struct)
 
