@@ -22,6 +22,7 @@ class ImplicitDamping:
         matters: whether there is damping that a step of the model's timestep does not resolve. If not, steps are MuJoCo's own.
         share: of a joint's acceleration, in which MuJoCo's forces give it at rest, that comes within a step of the model's timestep:
             M / (M + Δt D) on the diagonal, (nv,); 1 where damping does not matter.
+        geoms: True for geoms that a joint moves whose damping matters, (ngeom + 1,); the last one, of no geom, is False.
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
@@ -39,6 +40,9 @@ class ImplicitDamping:
         step = model.opt.timestep
         self.matters = bool((step * damping > _MATTERS * mass).any())
         self.share = mass / (mass + step * damping) if self.matters else np.ones(model.nv)
+        slowed = self.share < 1.0 / (1.0 + _MATTERS)
+        chains = [_degrees_of_freedom(model, body) for body in model.geom_bodyid.tolist()]
+        self.geoms = np.array([*(bool(slowed[chain].any()) for chain in chains), False])
 
     def clear(self) -> None:
         """Forget environments that were not stepped."""
@@ -80,3 +84,13 @@ class ImplicitDamping:
             mujoco.mj_copyData(self._scratch, model, data)
         mujoco.mj_implicit(model, self._scratch)
         return -self._scratch.qDeriv[self._of_mass]
+
+
+def _degrees_of_freedom(model: mujoco.MjModel, body: int) -> list[int]:
+    """Degrees of freedom that move a body."""
+    result: list[int] = []
+    while body:
+        first = int(model.body_dofadr[body])
+        result += range(first, first + int(model.body_dofnum[body]))
+        body = int(model.body_parentid[body])
+    return result

@@ -63,3 +63,22 @@ def test_after_a_step_the_mass_matrix_is_mujoco_s_own_and_others_steps_are_left_
     np.testing.assert_array_equal(data.qLD, own.qLD)
     light = mujoco.MjSpec.from_string('<mujoco><worldbody><body><joint damping="1"/><geom size="1"/></body></worldbody></mujoco>')
     assert not ImplicitDamping(light.compile()).matters and ImplicitDamping(world.model).matters
+
+
+def test_a_finger_that_opens_does_not_push_what_lies_below_its_case() -> None:
+    """Its servo accelerates it by some 900 m/s² for its mass alone: MuJoCo's cone would reach across the gap of 2.6 mm."""
+    world = TactileWorld("lift_cube_env", outputs=())
+    data, model = world.data[0], world.models[0]
+    model.opt.gravity[:] = 0.0  # the arm's motors are idle
+    case = data.geom("left_case")
+    bottom = case.xpos[2] - np.abs(case.xmat.reshape(3, 3)[2]) @ model.geom("left_case").size
+    pose = np.eye(4)
+    pose[:3, 3] = case.xpos[0], case.xpos[1] + 10e-3, bottom - 2.6e-3 - 15e-3
+    ctrl = world.composed.ctrl.copy()
+    assert world.composed.opening is not None
+    for opening in (0.02, 0.08):
+        world.reset(bodies={"object": pose[None]})
+        ctrl[world.composed.opening] = opening
+        world.step(ctrl)
+        assert not world.failed.any() and np.abs(data.qvel[7]) > 1e-3 * (opening < 0.05)
+        np.testing.assert_allclose(data.body("object").xpos, pose[:3, 3], rtol=0.0, atol=1e-9)

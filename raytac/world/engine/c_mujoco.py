@@ -67,6 +67,8 @@ class CMujoco:
         state, one = checked_layouts()
         self._models_now, self._pads, self._timestep = models, pads, timestep
         self._contact, self._views, self._blank, self._damping = contact, HostViews(contact), _blank(), ImplicitDamping(model)
+        self._hard = np.append(pads.hard, False)
+        self._slows, self._slows_geom = self._damping.matters and bool(pads.hard.any()), self._damping.geoms
         self._address, self._sparse = np.zeros(num_envs, np.uint64), np.zeros(1, np.int32)
         self._datas: list[mujoco.MjData] = []
         self._models: list[mujoco.MjModel] = []
@@ -172,9 +174,18 @@ class CMujoco:
         count = len(envs)
         lost, rows = views.lost[:count].tolist(), []
         for i, number in enumerate(views.contacts[:count].tolist()):
-            if not number or lost[i]:
+            if lost[i]:
                 continue
             model, data = self._models[envs[i]], self._datas[envs[i]]
+            if not number:
+                # Otherwise a finger on a stiff servo would seem to slide so fast that MuJoCo's cone acts across a gap.
+                if (
+                    own_step
+                    and self._slows
+                    and (self._slows_geom[data.contact.geom] & self._hard[data.contact.geom].any(1)[:, None]).any()
+                ):
+                    self._damping.add(envs[i], model, data, float(views.length[i]))
+                continue
             for _ in range(number):
                 if mujoco.mj_addContact(model, data, blank) != 0:
                     self._lose(envs[i], i)

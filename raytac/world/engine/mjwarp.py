@@ -94,7 +94,7 @@ class MujocoWarp:
         self._contacts = 24 + 2 * slots[0] * slots[1] + 4 * slots[1] if contacts is None else contacts
         self._rows = 4 * self._contacts if rows is None else rows
         damping = ImplicitDamping(model)
-        self._damped = damping.matters
+        self._damped, self._always = damping.matters, int(pads.hard.any())
         with wp.ScopedDevice(self.device):
             sizes = {name: num_envs for name in _VARIED if getattr(model, name).size}
             try:
@@ -217,7 +217,7 @@ class MujocoWarp:
     def _add_damping(self) -> None:
         model, data, steps = self.model, self.data, self._contact.steps
         self._mjw.deriv_smooth_vel(model, data, self._damped_mass)
-        self._launch(kernels.add_damping, self._mass.shape, [self._worlds, steps, self._damped_mass, self._mass])
+        self._launch(kernels.add_damping, self._mass.shape, [self._worlds, steps, self._always, self._damped_mass, self._mass])
         self._mjw.factor_m(model, data)
         self._mjw.solve_m(model, data, data.qacc_smooth, data.qfrc_smooth)
 

@@ -434,11 +434,13 @@ def correct_lifts(worlds: Worlds, own: Own, steps: Steps, slots: Slots):
 
 
 @wp.kernel
-def add_damping(worlds: Worlds, steps: Steps, damped: wp.array2d(dtype=wp.float32), mass: wp.array2d(dtype=wp.float32)):
-    """Keep the mass matrix, and put that with the damping of a step where gels touch (see ``implicit_damping``)."""
+def add_damping(
+    worlds: Worlds, steps: Steps, always: wp.int32, damped: wp.array2d(dtype=wp.float32), mass: wp.array2d(dtype=wp.float32)
+):
+    """Keep the mass matrix, and put that with the damping of a step where gels touch, or ``always`` (see ``implicit_damping``)."""
     i, k = wp.tid()
     mass[i, k] = worlds.M[i, k]
-    if steps.contacts[i] > 0 and steps.lost[i] == 0:
+    if (always != 0 or steps.contacts[i] > 0) and steps.lost[i] == 0:
         worlds.M[i, k] = damped[i, k]
 
 
