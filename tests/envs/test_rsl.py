@@ -148,3 +148,14 @@ def test_a_policy_does_what_it_did_in_training(tmp_path: Path) -> None:
 def test_bad_options_are_named(tmp_path: Path, options: dict, text: str) -> None:
     with pytest.raises(InputError, match=text):
         train_gpu.main(replace(SMALL, out=tmp_path / "out", **options))
+
+
+def test_policies_that_are_shipped_fit_their_environments() -> None:
+    shipped = sorted((Path(__file__).parents[2] / "experiments" / "policies").glob("*_ppo.pt"))
+    assert len(shipped) >= 3
+    for path in shipped:
+        assert path.stat().st_size < 2e6 and FlatPolicy.is_one(path)
+        policy = FlatPolicy(path)
+        vector = policy.vector(1)
+        actions = policy(vector.buffers["actor"])
+        assert actions.shape == vector.buffers["action"].shape and np.isfinite(actions).all()

@@ -65,7 +65,8 @@ def test_a_film_has_the_colours_of_a_sensor_and_its_help_names_policies_that_are
 
 
 def test_policies_that_are_shipped_fit_their_environments() -> None:
-    shipped = sorted((Path(__file__).parents[2] / "experiments" / "policies").glob("*.pt"))
+    folder = Path(__file__).parents[2] / "experiments" / "policies"
+    shipped = sorted(set(folder.glob("*.pt")) - set(folder.glob("*_ppo.pt")))  # those of train_gpu.py: tests/envs/test_rsl.py
     assert shipped
     for path in shipped:
         saved = Checkpoint.load(path)
