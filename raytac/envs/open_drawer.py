@@ -60,7 +60,8 @@ class OpenDrawerEnv(TactileEnv):
     r"""Pull a drawer open by its handle, held between two sensors, to a given place.
 
     A Panda's fingers are two GelSight Minis (9 x 11 markers) over the handle of a drawer of 0.5 kg, which slides on a table in a cabinet
-    with 0.5 mm of play (scene `open_drawer`). Held too softly the handle slips out of the gels.
+    with 0.5 mm of play (scene `open_drawer`). Held too softly the handle slips out of the gels. The cabinet has no back wall: who pushes
+    slides the drawer out behind.
 
     Action, Box(-1, 1, (4,)): displacement of the target of the point between the pads along world x, y, z (4 mm a step at 1), and change
     of the commanded opening (4 mm). The target leads the tool by at most 10 mm along an axis and stays in x 0.32 to 0.50,

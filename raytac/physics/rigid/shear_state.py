@@ -20,7 +20,10 @@ class _Member:
 
     def __get__(self, state: ShearState, _: type) -> np.ndarray:
         view = state.views.get(self._name)
-        return getattr(state.struct, self._name).numpy() if view is None else view
+        if view is None:
+            view = getattr(state.struct, self._name).numpy()
+            view.flags.writeable = False  # a copy: what is written to it would be lost
+        return view
 
 
 class ShearState:

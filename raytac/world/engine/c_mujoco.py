@@ -182,7 +182,7 @@ class CMujoco:
                 if (
                     own_step
                     and self._slows
-                    and (self._slows_geom[data.contact.geom] & self._hard[data.contact.geom].any(1)[:, None]).any()
+                    and (self._slows_geom[data.contact.geom] & np.any(self._hard[data.contact.geom], axis=1, keepdims=True)).any()
                 ):
                     self._damping.add(envs[i], model, data, float(views.length[i]))
                 continue
