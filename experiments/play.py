@@ -12,6 +12,7 @@ evaluation: no training has seen them.
 from __future__ import annotations
 
 import itertools
+import os
 import shutil
 import subprocess
 import sys
@@ -70,6 +71,7 @@ class Film:
 
 def main(args: Args) -> dict[str, Metric]:
     """Play a policy and write the film, the strip and the metrics."""
+    os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported, which is below
     if args.episodes < 0 or args.num_envs < 1:
         name, least = ("episodes", 0) if args.episodes < 0 else ("num_envs", 1)
         raise InputError(name, value=getattr(args, name), rule=f"must be {least} or more")
