@@ -115,17 +115,22 @@ def no_collection() -> Iterator[None]:
             gc.enable()
 
 
-def peak_bytes(call: Callable[[], object], device: str) -> int:
-    """Most bytes of Dr.Jit's arrays during ``call`` beyond those before; 0 without Dr.Jit.
+def peak_bytes(call: Callable[[], object], device: str, *, calls: int = 3) -> int:
+    """Most bytes of Dr.Jit's arrays during one of ``calls`` runs of ``call``, beyond those before; 0 without Dr.Jit.
 
-    The allocator's cache is emptied first, so that memory kept from earlier work does not hide what the call needs; that makes the next
-    calls slower. Acceleration structures of the ray tracer (Embree, OptiX) are not Dr.Jit arrays and not counted.
+    Kernels run beside the code that launches them, so memory that one frees may or may not be free in time for the next: only the
+    largest of several runs is the same from one process to another. The allocator's cache is emptied before each run, so that memory
+    kept from earlier work does not hide what the call needs; that makes the next calls slower. Acceleration structures of the ray
+    tracer (Embree, OptiX) are not Dr.Jit arrays and not counted.
     """
     backend = dr.JitBackend.CUDA if device == "cuda" else dr.JitBackend.LLVM
-    dr.sync_thread()
-    dr.flush_malloc_cache()
-    dr.detail.malloc_clear_statistics()
-    before = dr.detail.malloc_watermark(backend)
-    call()
-    dr.sync_thread()
-    return dr.detail.malloc_watermark(backend) - before
+    peak = 0
+    for _ in range(calls):
+        dr.sync_thread()
+        dr.flush_malloc_cache()
+        dr.detail.malloc_clear_statistics()
+        before = dr.detail.malloc_watermark(backend)
+        call()
+        dr.sync_thread()
+        peak = max(peak, dr.detail.malloc_watermark(backend) - before)
+    return peak
