@@ -24,7 +24,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 BINS = 4 * (LAW_POINTS - 1)
 """Bins of gaps: regions below so many levels are tried for the contact."""
 Sums = wp.types.vector(length=5, dtype=wp.float64)
-"""Of a bin: nodes in quarters, sums of their numbers along x and y, of squares of distances from the pad's first node and of gaps."""
+"""Of a bin: nodes in parts, sums of their numbers along x and y, of squares of distances from the pad's first node and of gaps."""
 _BINS = wp.constant(wp.int32(BINS))
 _SCALE = wp.constant(wp.float64(BINS))
 _POINTS = wp.constant(wp.int32(LAW_POINTS))
@@ -32,13 +32,14 @@ _ENTRIES = wp.constant(wp.float64(ENTRIES - 1))
 _LAST_ENTRY = wp.constant(wp.int32(ENTRIES - 2))
 _FIRST_ENTRY, _ENTRY = wp.constant(wp.int32(2)), wp.constant(wp.int32(3))
 """Of the response in a gel's constants: its place and the numbers of one entry."""
-_GAP_UNIT = wp.constant(wp.float64(2.0**34))
-"""Of a bin's sum of gaps, over the greatest gap: 10^5 nodes fit into a sum."""
-_SQUARE_UNIT = wp.constant(wp.float64(2.0**14))
+_GAP_UNIT = wp.constant(wp.float64(2.0**27))
+"""Of a bin's sum of gaps, over the greatest gap: 6·10^4 nodes fit into a sum."""
+_SQUARE_UNIT = wp.constant(wp.float64(2.0**9))
 """Of a bin's sum of squares, over the spacing's square."""
 _SMOOTH = wp.constant(wp.float64(SMOOTH))
 _LEAST_STEP = wp.constant(wp.float64(1e-12))
-_QUARTERS = wp.constant(wp.float64(0.25))
+_NODE = wp.constant(wp.float64(1024.0))
+"""Parts of a node that are counted."""
 _1 = wp.constant(wp.float64(1.0))
 _2 = wp.constant(wp.float64(2.0))
 _3 = wp.constant(wp.float64(3.0))
@@ -104,22 +105,18 @@ def clear_bins(bins: Bins, block: wp.int32, lane: wp.int32, lanes: wp.int32):
 
 @wp.func
 def add_node(
-    sums: wp.array(dtype=Sums), share: wp.float64, i: wp.int32, j: wp.int32, nx: wp.int32, ny: wp.int32, flat: wp.float64
+    sums: wp.array(dtype=Sums), share: wp.float64, i: wp.int32, j: wp.int32, flat: wp.float64, weight: wp.float64
 ):  # fmt: skip
-    """Add node ``i``, ``j`` of a pad's ``nx`` by ``ny`` to the bins of a block; the result does not depend on the order.
+    """Add node ``i``, ``j`` of a pad to the bins of a block; the result does not depend on the order.
 
-    ``share``: its gap at touch over the farthest that counts, in [0, 1). ``flat``: spacing along y over that along x. A node on an edge of
-    the pad stands for half a cell, one in a corner for a quarter.
+    ``share``: its gap at touch over the farthest that counts, in [0, 1). ``flat``: spacing along y over that along x. ``weight``: cells for
+    which the node stands; what is added to one node may be negative, and not their sum.
     """
     k = wp.min(wp.int32(wp.sqrt(share) * _SCALE), _BINS - 1)
-    quarters = wp.float64(4.0)
-    if i == 0 or i == nx - 1:
-        quarters = _2
-    if j == 0 or j == ny - 1:
-        quarters *= _HALF
+    parts = wp.floor(_NODE * weight + _HALF)
     x, y = wp.float64(i), wp.float64(j)
     square = wp.floor((x * x + y * y * flat * flat) * _SQUARE_UNIT + _HALF)
-    wp.atomic_add(sums, k, quarters * Sums(_1, x, y, square, wp.floor(share * _GAP_UNIT)))
+    wp.atomic_add(sums, k, parts * Sums(_1, x, y, square, wp.floor(share * _GAP_UNIT)))
 
 
 @wp.func
@@ -161,7 +158,7 @@ def regions(
     for k in range(_BINS):
         if bins.sums[block, k][0] == _0:
             continue
-        sums = _QUARTERS * bins.sums[block, k]
+        sums = bins.sums[block, k] / _NODE
         more, dx, dy, dsquare = sums[0], sums[1], sums[2] * flat, sums[3] / _SQUARE_UNIT
         gap = sums[4] / (_GAP_UNIT * more) * _HALF * deepest
         before = wp.float64(nodes + _0)

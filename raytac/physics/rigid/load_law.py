@@ -97,16 +97,24 @@ class LoadLaw:
     same area. Near the bonded face the law grows without bound (``hard_back``). F is strictly increasing in δ and 0 at δ <= 0.
     """
 
-    def __init__(self, gap: np.ndarray, x: np.ndarray, y: np.ndarray, gelpad: GelpadSpec, deepest: float = np.inf) -> None:
+    def __init__(
+        self,
+        gap: np.ndarray,
+        x: np.ndarray,
+        y: np.ndarray,
+        gelpad: GelpadSpec,
+        deepest: float = np.inf,
+        cells: np.ndarray | None = None,
+    ) -> None:
         """``gap`` (Ny, Nx) [m]: distance along z from the resting gel to the object at first touch, >= 0, ``inf`` where there
         is none, at evenly spaced places ``x`` (Nx,) and ``y`` (Ny,) in the pad frame [m]; ``deepest`` [m]: where there is gel for, at most
-        the pad's thickness."""
+        the pad's thickness; ``cells`` (Ny, Nx): cells for which each place stands, one each and on the pad's edges half of one if None."""
         self._gelpad = gelpad
         self.deepest = min(deepest, gelpad.thickness)
         """Greatest depth that a press may have [m]."""
         self.depth = gelpad.thickness * _DEPTHS
         """Depths of the table [m], 0 to the pad's thickness, denser at the start."""
-        stiffness, offset = region_lines(gap, x, y, gelpad)
+        stiffness, offset = region_lines(gap, x, y, gelpad, cells=cells)
 
         def force(depth: np.ndarray) -> np.ndarray:
             return (stiffness * depth[:, None] - offset).max(axis=1)
@@ -177,7 +185,13 @@ class LoadLaw:
 
 
 def region_lines(
-    gap: np.ndarray, x: np.ndarray, y: np.ndarray, gelpad: GelpadSpec, highest: float = np.inf, levels: int = 1024
+    gap: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    gelpad: GelpadSpec,
+    highest: float = np.inf,
+    levels: int = 1024,
+    cells: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Stiffness k [N/m] and k ⟨gap⟩ [N] of regions, (n,) each: F = k δ − k ⟨gap⟩ of each, and the contact's is the greatest.
 
@@ -189,9 +203,7 @@ def region_lines(
     highest = min(highest, layer.share.max() * gelpad.thickness)
     j, i = np.nonzero(gap < highest)
     g, x_near, y_near = gap[j, i], x[i], y[j]
-    # A node on an edge of the pad stands for half a cell, one in a corner for a quarter.
-    at_x, at_y = (np.where(np.abs(v) > 0.5 * size - _AT_EDGE, 0.5, 1.0) for v, size in zip((x, y), gelpad.size, strict=True))
-    weight = at_x[i] * at_y[j]
+    weight = (cells_of(x, y, gelpad) if cells is None else cells)[j, i]
     level = (np.sqrt(g / highest) * levels).astype(int)
     sums = (weight * term for term in (1.0, x_near, y_near, x_near**2 + y_near**2, g))
     of_level = np.array([np.bincount(level, term, levels) for term in sums])
@@ -211,6 +223,12 @@ def region_lines(
     under = within + mean + (12.0 * moment[1:] - 6.0) * (tilted - 0.5 * mean) + bend[1:] * (2.0 * twice - 3.0 * ranked + mean)
     stiffness = 2.0 * reduced_modulus(gelpad) * radius * stiffening
     return stiffness, stiffness * np.append(0.0, np.maximum(under, 0.0))
+
+
+def cells_of(x: np.ndarray, y: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
+    """Cells for which each place stands, (Ny, Nx): one on an edge of the pad for half of one, one in a corner for a quarter."""
+    at_x, at_y = (np.where(np.abs(v) > 0.5 * size - _AT_EDGE, 0.5, 1.0) for v, size in zip((x, y), gelpad.size, strict=True))
+    return at_y[:, None] * at_x
 
 
 def _punch_radius(stiffness: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:

@@ -218,6 +218,17 @@ def window(pads: Pads, placed: Placed, block: wp.int32, pad: wp.int32, level: wp
 
 
 @wp.func
+def larger(a: wp.float64, b: wp.float64) -> wp.float64:
+    """``wp.max`` without its care for NaN, which takes longer than all else at a node."""
+    return wp.where(a > b, a, b)
+
+
+@wp.func
+def smaller(a: wp.float64, b: wp.float64) -> wp.float64:
+    return wp.where(a < b, a, b)
+
+
+@wp.func
 def under(shapes: Shapes, placed: Placed, block: wp.int32, x: wp.float64, y: wp.float64, top: wp.bool) -> wp.float64:
     """Lowest z [m] of the placed parts on the line at x, y, inf if it misses all; or (``top``) the highest, inf of a half-space.
 
@@ -229,14 +240,15 @@ def under(shapes: Shapes, placed: Placed, block: wp.int32, x: wp.float64, y: wp.
         if part >= 0:
             c, h = placed.centre[block, k], placed.half[block, k]
             if wp.abs(x - c[0]) <= h[0] and wp.abs(y - c[1]) <= h[1]:
-                turn, side = wp.mat33d(placed.rotation[block, k]), wp.float64(1.0)
+                turn, at, across_y = wp.mat33d(placed.rotation[block, k]), wp.vec3d(placed.at[block, k]), wp.float64(y)
                 if top:
                     if shapes.kind[part] == _PLANE:
                         return _INF
-                    side = wp.float64(-1.0)
-                over = wp.diag(wp.vec3d(_1, side, side))
-                at = over * placed.at[block, k]
-                result = wp.min(result, first_hit(shapes, part, over * turn, at, x, side * y))
+                    over = wp.diag(wp.vec3d(_1, -_1, -_1))
+                    turn = over * turn
+                    at = over * at
+                    across_y = -y
+                result = smaller(result, first_hit(shapes, part, turn, at, x, across_y))
     if top:
         return -result
     return result
@@ -260,17 +272,6 @@ def entries_of(size: wp.vec3d, rotation: wp.mat33d, at: wp.vec3d):
         length[k] = _2 * size[k] * wp.abs(inverse)
         k += 1
     return entry, length
-
-
-@wp.func
-def larger(a: wp.float64, b: wp.float64) -> wp.float64:
-    """``wp.max`` without its care for NaN, which takes longer than all else at a node."""
-    return wp.where(a > b, a, b)
-
-
-@wp.func
-def smaller(a: wp.float64, b: wp.float64) -> wp.float64:
-    return wp.where(a < b, a, b)
 
 
 @wp.func

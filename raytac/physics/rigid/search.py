@@ -20,7 +20,7 @@ from raytac.warp_runtime import LAUNCH, start_warp
 
 _LANES = 128
 """Threads of a block on CUDA."""
-_MEMORY = 256e6
+_MEMORY = 512e6
 """Most memory that the nodes of all blocks take on CUDA [byte]."""
 
 
@@ -28,7 +28,8 @@ class PadSearch:
     """Contacts of the pads and bodies of a world.
 
     The overlap of a resting pad and a body's underside is measured on nodes in the pad's frame: on the first grid (spacing 0.8, 0.4,
-    0.2 mm) of which it covers 150 nodes, else on the last; parabolas between the nodes refine its depth. Bodies that are narrow as seen
+    0.2 mm) of which it covers 150 nodes, else on the last; parabolas between the nodes refine its depth. Nodes at a body's edges stand for
+    the area that it covers beside them, so that its force does not jump where they pass nodes. Bodies that are narrow as seen
     along z, convex ones than 20 cells of the last grid and others than two, are measured on finer ones, down to 0.05 mm. The gap of a
     body that does not touch is measured likewise.
 
@@ -155,7 +156,7 @@ class PadSearch:
         """Memory of the blocks: one on a CPU, where Warp runs one thread after the other."""
         blocks = 1
         if self.device.is_cuda:
-            most = int(_MEMORY / (8 * self._pads.most_nodes))
+            most = int(_MEMORY / (16 * self._pads.most_nodes))
             blocks = max(min(num_envs * self._shape[0] * self._shape[1], 8 * self.device.sm_count, most), 1)
         self._blocks = blocks
         work: Any = Work()
@@ -165,6 +166,7 @@ class PadSearch:
         work.bins.sums = wp.zeros((blocks, BINS), dtype=Sums, device=self.device)
         work.bins.lines = wp.zeros((blocks, BINS + 1), dtype=wp.vec3d, device=self.device)
         work.gap = wp.zeros((blocks, self._pads.most_nodes), dtype=wp.float64, device=self.device)
+        work.ends = wp.zeros((blocks, self._pads.most_around), dtype=wp.vec2f, device=self.device)
         return work
 
     def _record(self) -> None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import warp as wp
 
 from raytac.physics.rigid.contact_rows import LAST, Rows, missing_row, place_of_gap
+from raytac.physics.rigid.cover_kernels import add_outline
 from raytac.physics.rigid.law_kernels import DEEPER, Bins, add_node, clear_bins, deepest_of, most_deepest, tabulate
 from raytac.physics.rigid.node_kernels import (
     between_nodes,
@@ -80,6 +81,8 @@ class Work:
     bins: Bins
     gap: wp.array2d(dtype=wp.float64)
     """Gaps of a window's nodes [m], (blocks, most nodes)."""
+    ends: wp.array2d(dtype=wp.vec2f)
+    """Where the outline crosses the edges from each node on along x and y, of their length."""
     ahead: wp.float64
     """See ``PadSearch``."""
 
@@ -269,12 +272,13 @@ def measure_pair(
     first, second = wp.vec3d(), wp.vec3d()  # number of nodes and first moments, second moments of the overlap's area
     clear_bins(work.bins, block, lane, lanes)
     total_of(_0)
-    nodes_x, nodes_y = wp.int32(pads.nx[pad, level]), wp.int32(pads.ny[pad, level])
-    flat, farthest = step_y / step_x, _HALF * deepest
-    inverse, sums = _1 / farthest, work.bins.sums[block]
+    last_x, last_y = pads.nx[pad, level] - 1, pads.ny[pad, level] - 1
+    flat, below, sums = step_y / step_x, _HALF * deepest - depth, work.bins.sums[block]
+    inverse = _1 / (_HALF * deepest)
     j = lane // across()
     while j < ny:
         v = pads.lines[fy + j0 + j] + wp.vec3d()
+        cells = wp.where(j0 + j == 0 or j0 + j == last_y, _HALF, _1)  # a node on an edge of the pad stands for half of one
         row_s, row_n, row_x, row_xx = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
         i = lane % across()
         while i < nx:
@@ -288,15 +292,17 @@ def measure_pair(
                 row_n += wp.float64(1.0)
                 row_x += u[0]
                 row_xx += u[0] * u[0]
-            at_touch = larger(gap + depth, _0)
-            if at_touch < farthest:
-                add_node(sums, at_touch * inverse, i0 + i, j0 + j, nodes_x, nodes_y, flat)
+            if gap < below:
+                weight = wp.where(i0 + i == 0 or i0 + i == last_x, _HALF * cells, cells)
+                add_node(sums, larger(gap + depth, _0) * inverse, i0 + i, j0 + j, flat, weight)
             i += across()
         s += row_s
         sv += row_s * v
         first += wp.vec3d(row_n, row_x, row_n * v[0])
         second += wp.vec3d(row_xx, row_x * v[0], row_n * v[0] * v[0])
         j += wp.block_dim() // across()
+    area = wp.vec4i(i0, j0, nx, ny)
+    add_outline(shapes, pads, placed, block, lane, pad, level, area, gaps, work.ends[block], below, depth, inverse, flat, sums)
     s, szz = total_of(s), total_of(szz)
     sx, sz, slope_x = total_of(su[0]), total_of(su[1] + sv[1]), total_of(su[2])
     sy, slope_y = total_of(sv[0]), total_of(sv[2])

@@ -131,6 +131,8 @@ class PadArrays:
                     lines.append(np.stack([line, rest, np.gradient(rest, line)], axis=1))
         self.most_nodes = int((nx[:, last] * ny[:, last]).max(initial=_LEAST_MEMORY))
         """Nodes that a window may have."""
+        self.most_around = self.most_nodes + int((nx + ny).max(initial=0)) + 1
+        """The same with one line more along x and y."""
         pads: Any = Pads()
         pads.half = _array([[0.5 * size for size in gelpad.size] for gelpad in gelpads], wp.vec2d, device)
         pads.thickness = _array([gelpad.thickness for gelpad in gelpads], wp.float64, device)

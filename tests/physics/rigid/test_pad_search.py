@@ -14,7 +14,7 @@ from raytac.gel.surface import make_grid
 from raytac.physics.rigid.contacts import LAW_POINTS, PadContacts
 from raytac.physics.rigid.law_kernels import BINS
 from raytac.physics.rigid.layer_response import layer_response
-from raytac.physics.rigid.load_law import region_lines
+from raytac.physics.rigid.load_law import LoadLaw, region_lines
 from raytac.physics.rigid.search import PadSearch
 from raytac.se3 import rotations
 from raytac.shapes.part import Part, mesh_part, primitive
@@ -23,6 +23,7 @@ from raytac.shapes.underside import object_height, object_radius
 from raytac.specs import load_sensor
 from raytac.specs.sensor import GelpadSpec
 from tests.physics.rigid.oracle import PadOverlap
+from tests.physics.rigid.oracle_cover import Covered
 from tests.physics.rigid.oracle_pierced import BondedFace
 from tests.physics.rigid.pad_overlap import least_width
 
@@ -139,15 +140,18 @@ def test_contacts_are_those_of_the_reference(gelpad: GelpadSpec) -> None:
         assert contacts.depth[k] == pytest.approx(depth, abs=1e-6), name
         np.testing.assert_allclose(contacts.centre[k], touches.centre[0], atol=5e-6, err_msg=name)
         np.testing.assert_allclose(contacts.normal[k], touches.normal[0], atol=1e-6, err_msg=name)
-        law = overlap.law(touches, 0)
+        covered = Covered(body, poses[k], gelpad, (touches.x[0], touches.y[0]), round(math.sqrt(touches.cell[0]), 5))
         depths = contacts.deepest[k] * np.linspace(0.0, 1.0, LAW_POINTS) ** 2
         at = np.flatnonzero((depths > 0.8 * depth) & (depths <= (1.0 + 1e-9) * min(depth, gelpad.thickness)))
         assert len(at) and contacts.deepest[k] > depth
         gap = np.maximum(touches.gap[0] + depth, 0.0)
-        slope, offset = region_lines(gap, touches.x[0], touches.y[0], gelpad, 0.5 * contacts.deepest[k], BINS)
+        highest = 0.5 * contacts.deepest[k]
+        cells = covered.cells(highest - depth)
+        slope, offset = region_lines(gap, touches.x[0], touches.y[0], gelpad, highest, BINS, cells)
         force = (slope * depths[at, None] - offset).max(axis=1)
         np.testing.assert_allclose(contacts.force[k, at], force, rtol=5e-3, err_msg=name)
         nodes = np.count_nonzero(touches.gap[0] < 0.0)
+        law = LoadLaw(gap, touches.x[0], touches.y[0], gelpad, cells=cells)
         finely = [law.force(d) for d in depths[at]]
         np.testing.assert_allclose(contacts.force[k, at], finely, rtol=5e-3 + 1.5 / nodes, err_msg=name)
         # Of contacts wider than the gel is thick, not all nodes count that the radius would need.
@@ -414,3 +418,66 @@ def test_a_convex_body_is_measured_as_any_other(kind: str, gelpad: GelpadSpec) -
         np.testing.assert_allclose(these, those, rtol=1e-4, atol=1e-9, err_msg=name)
     lowest = (under - (least + shift)[:, None, None]).min(axis=(1, 2))[one.env]
     np.testing.assert_allclose(one.clearance, gelpad.thickness + lowest, atol=60e-6)
+
+
+def prism(corners: int, radius: float, half: float) -> Part:
+    mesh = trimesh.creation.cylinder(radius, 2.0 * half, sections=corners)
+    return mesh_part(mesh.vertices, mesh.faces)
+
+
+FLAT_FACES = {
+    "box": (primitive("box", (4e-3, 5e-3, 3e-3)), np.eye(3)),
+    "coin": (primitive("cylinder", (5e-3, 1e-3)), np.eye(3)),
+    "cylinder": (primitive("cylinder", (4e-3, 5e-3)), rotations(np.array([[0.0, math.pi / 2, 0.0]]))[0]),
+    "capsule": (primitive("capsule", (4e-3, 5e-3)), rotations(np.array([[0.0, math.pi / 2, 0.0]]))[0]),
+    "cone": (primitive("cone", (5e-3, 6e-3, 0.5e-3)), np.diag([1.0, -1.0, -1.0])),
+    "square mesh": (prism(4, 6e-3, 3e-3), rotations(np.array([[0.0, 0.0, math.pi / 4]]))[0]),
+    "hexagonal mesh": (prism(6, 5e-3, 3e-3), np.eye(3)),
+}
+SWEEPS = {"x": 2e-6, "y": 2e-6, "depth": 0.5e-6, "roll": 1e-4, "pitch": 1e-4, "yaw": 5e-4}
+"""Steps [m] or [rad]."""
+
+
+def swept(part: Part, turn: np.ndarray, gelpad: GelpadSpec, along: str, count: int = 401) -> np.ndarray:
+    """Poses (count, 4, 4) about one that is 0.3 mm deep, less than a node's spacing on either side."""
+    poses, grid = np.tile(np.eye(4), (count, 1, 1)), make_grid(gelpad, 0.1e-3)
+    poses[:, :3, :3], poses[:, :3, 3] = turn, (1.3e-3, 0.7e-3, 0.0)
+    poses[:, 2, 3] -= (object_height([part], poses[:1], grid.x, grid.y)[0] - grid.rest).min() + 0.3e-3
+    steps = SWEEPS[along] * (np.arange(count) - count // 2)
+    if along in "xy":
+        poses[:, "xy".index(along), 3] += steps
+    elif along == "depth":
+        poses[:, 2, 3] -= steps
+    else:
+        axis = np.eye(3)[["roll", "pitch", "yaw"].index(along)]
+        poses[:, :3, :3] = rotations(steps[:, None] * axis) @ turn
+    return poses
+
+
+def forces(contacts: PadContacts) -> np.ndarray:
+    at = contacts.deepest[:, None] * np.linspace(0.0, 1.0, LAW_POINTS) ** 2
+    return np.array([np.interp(d, line, row) for d, line, row in zip(contacts.depth, at, contacts.force, strict=True)])
+
+
+@pytest.mark.parametrize("gelpad", [DOME, FLAT], ids=["dome", "flat"])
+@pytest.mark.parametrize("along", SWEEPS)
+@pytest.mark.parametrize("kind", FLAT_FACES)
+def test_a_force_does_not_jump_where_edges_pass_nodes(kind: str, along: str, gelpad: GelpadSpec) -> None:
+    """Less than 1 % from pose to pose, beyond what the poses beside them change."""
+    part, turn = FLAT_FACES[kind]
+    contacts = search_one(gelpad, [part], swept(part, turn, gelpad, along), reach=20e-6)
+    assert len(contacts.env) == 401
+    force = forces(contacts)
+    change = np.abs(np.diff(force)) / force[1:]
+    beside = np.lib.stride_tricks.sliding_window_view(np.pad(change, 10, mode="edge"), 21)
+    assert (change - 2.0 * np.median(beside, axis=1)).max() < 0.01
+
+
+@pytest.mark.parametrize("kind", ["box", "square mesh"])
+def test_a_face_has_its_area_wherever_it_lies(kind: str) -> None:
+    part, turn = FLAT_FACES[kind]
+    contacts = search_one(FLAT, [part], swept(part, turn, FLAT, "x")[::20], reach=20e-6)
+    area = 8e-3 * 10e-3 if kind == "box" else 2.0 * 6e-3**2
+    np.testing.assert_allclose(np.pi * contacts.radius[:, -1] ** 2, area, rtol=0.01)
+    force = forces(contacts)
+    np.testing.assert_allclose(force, force.mean(), rtol=0.005)
