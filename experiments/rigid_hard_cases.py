@@ -73,8 +73,8 @@ SLOW = ("grasps_coin_*", "grasps_mesh_*")
 PIECE = 128
 """Most grasps of one case: a long run is resumed, and divided among processes, by cases."""
 THIN = 0.03035e-3
-"""Pitch of a press of thin bodies [m], on whose nodes a blade of 1 mm has its area within 0.2 %: by 0.03 mm it is off by 1 %, by 0.1 mm by a
-tenth."""
+"""Pitch of a press of thin bodies [m], on whose nodes a blade of 1 mm has its area within 0.2 %: by 0.03 mm it is off by 1 %, by 0.1 mm
+by a tenth."""
 Row = dict[str, Any]
 Lengths = dict[str, float | int | str]
 
