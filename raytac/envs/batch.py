@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from raytac.checks import check_known, check_numbers, check_whole
+from raytac.device import resolve_device
 from raytac.envs.action_control import ACTIONS, ActionControl
 from raytac.envs.task_observation import body_from_tool, state_and_goal
 from raytac.envs.task_outcome import task_outcome
@@ -18,6 +19,7 @@ from raytac.envs.task_rules import Task, TaskState
 from raytac.errors import InputError
 from raytac.gel.surface import COARSEST_PITCH, rounded_envs
 from raytac.observe import ArraySpec, ObservationSettings, Randomization, TactileObserver, randomised_bodies
+from raytac.optics.base import OPTICAL_OUTPUTS
 from raytac.physics.base import PhysicsConfig
 from raytac.physics.registry import checked_physics, scene_physics
 from raytac.robots.pose_errors import PoseErrors
@@ -115,6 +117,10 @@ class TaskBatch:
             options = probe.sensor_options()
         options["pitch"] = task_pitch(probe) if pitch is None else pitch
         self.world = TactileWorld(loaded, physics=config, device=device, **options)
+        if set(options["outputs"]) & set(OPTICAL_OUTPUTS) and resolve_device(device) == "cpu":
+            from raytac.optics.runtime import share_cores
+
+            share_cores()
         self._variations = VariationSampler(
             loaded, self.world.sensor_names, self.randomization, rigid=rigid, num_envs=num_envs, seed=seed
         )

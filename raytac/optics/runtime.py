@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -92,6 +93,16 @@ def _require_llvm() -> None:
             "`pip install karellen-llvm-core`, or set DRJIT_LIBLLVM_PATH to a libLLVM of version 16 or newer; "
             "`raytac doctor` tells what was tried"
         )
+
+
+def share_cores() -> None:
+    """Let Dr.Jit render with at most half of the processor's cores; a smaller number that was set before stays.
+
+    Its threads wait busily for the next image. Where physics and a policy run between two images, those threads take their cores, and
+    libraries whose threads wait for each other then wait for threads that do not run.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    dr.set_thread_count(min(dr.thread_count(), max(cores // 2, 1)))
 
 
 RENDERER = RLock()

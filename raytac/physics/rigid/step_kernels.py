@@ -28,7 +28,7 @@ from raytac.physics.rigid.world_kernels import (
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
-_TRAVEL = wp.constant(wp.float64(0.025))
+_TRAVEL = wp.constant(wp.float64(0.05))
 """Greatest share of the gel's thickness by which a contact closes or opens in a step."""
 _SWING = wp.constant(wp.float64(0.02))
 """Share of the thickness from which a contact that swings on its own stiffness is resolved …"""
