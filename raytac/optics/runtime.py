@@ -12,7 +12,7 @@ from typing import Any
 
 import drjit as dr
 
-from raytac.device import llvm_library, resolve_device
+from raytac.device import LLVM_MINIMUM, LLVM_NAMED_BY_USER, llvm_library, resolve_device
 from raytac.errors import BackendError
 
 VARIANTS = {"cuda": "cuda_ad_rgb", "cpu": "llvm_ad_rgb"}
@@ -25,7 +25,7 @@ def load_mitsuba(device: str = "auto") -> tuple[Any, str]:
     ``auto`` stays with it. The first ``cuda`` of a process traces one ray; where that fails, ``auto`` warns and takes the CPU.
 
     Raises:
-        BackendError: no LLVM library (CPU), no CUDA that works, or a process that already uses the other variant.
+        BackendError: no LLVM library or one too old (CPU), no CUDA that works, or a process that already uses the other variant.
     """
     resolved = resolve_device(device)
     if resolved == "cpu":
@@ -87,11 +87,18 @@ def _try_variant(mi: Any, variant: str, *, trace: bool = False) -> str:
 
 
 def _require_llvm() -> None:
-    if llvm_library() is None:
+    library = llvm_library()
+    if library is None:
         raise BackendError(
             "the ray tracer needs LLVM (or an NVIDIA GPU), and no libLLVM was found: "
             "`pip install karellen-llvm-core`, or set DRJIT_LIBLLVM_PATH to a libLLVM of version 16 or newer; "
             "`raytac doctor` tells what was tried"
+        )
+    version = dr.detail.llvm_version()
+    if version[0] < LLVM_MINIMUM and not LLVM_NAMED_BY_USER:
+        raise BackendError(
+            f"Dr.Jit has loaded libLLVM {'.'.join(map(str, version))}, which may abort the process, because drjit or mitsuba was imported "
+            f"before raytac: import raytac.optics first, or set DRJIT_LIBLLVM_PATH={library}"
         )
 
 
