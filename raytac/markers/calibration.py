@@ -13,7 +13,8 @@ import numpy as np
 
 from raytac.gel.surface import PadGrid, rest_height
 from raytac.markers.calibration_presses import LOADS, PressFrame
-from raytac.markers.contacts import TWIST_SLIP, ContactCells, Contacts, ContactTracker
+from raytac.markers.contact_tracker import ContactTracker
+from raytac.markers.contacts import TWIST_SLIP, ContactCells, Contacts
 from raytac.markers.force_field import contact_at
 from raytac.markers.pattern import marker_centres
 from raytac.markers.registry import models_without_coat

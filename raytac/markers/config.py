@@ -9,6 +9,7 @@ from raytac.checks import check_known, check_whole
 from raytac.gel.surface import PadGrid
 from raytac.markers.base import MarkerModel, MarkersConfig, marker_motion_of
 from raytac.markers.contacts import ContactCells
+from raytac.specs.marker_motion import MarkerMotionSpec
 from raytac.specs.press import PADS
 from raytac.specs.sensor import SensorSpec
 
@@ -22,15 +23,18 @@ class Fots(MarkersConfig):
 
     def slip(self, sensor: SensorSpec) -> float | None:
         """As of the sensor's marker motion."""
+        punch = self.motion(sensor).punch
+        return punch.slip if punch else None
+
+    def motion(self, sensor: SensorSpec) -> MarkerMotionSpec:
+        """The sensor's marker motion as far as this model takes it."""
         motion = marker_motion_of(sensor)
-        return motion.punch.slip if self.takes_punch and motion.punch else None
+        return motion if self.takes_punch else replace(motion, punch=None)
 
     def build(self, sensor: SensorSpec, grid: PadGrid, *, num_envs: int, device: str) -> MarkerModel:
         from raytac.markers.fots import FotsModel
 
-        motion = marker_motion_of(sensor)
-        motion = motion if self.takes_punch else replace(motion, punch=None)
-        return FotsModel(motion, ContactCells.over(grid, self.contacts), device=device)
+        return FotsModel(self.motion(sensor), ContactCells.over(grid, self.contacts), device=device)
 
 
 @dataclass(frozen=True)

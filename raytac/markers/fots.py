@@ -41,14 +41,11 @@ import warp as wp
 
 from raytac.device import resolve_device
 from raytac.gel.surface import GelSurface
-from raytac.markers.contacts import ContactCells, Contacts, ContactSamples
+from raytac.markers.contacts import COLUMNS, ContactCells, Contacts, ContactSamples
 from raytac.markers.fots_kernels import Cells, Constants, Drag, limit
 from raytac.markers.packet_kernels import PACKET, displace, packet
 from raytac.specs.marker_motion import MarkerMotionSpec
-from raytac.warp_runtime import start_warp
-
-_COLUMNS = 10
-"""Of ``Contacts.table`` that are read."""
+from raytac.warp_runtime import LAUNCH, start_warp
 
 
 class FotsModel:
@@ -111,7 +108,7 @@ class FotsArrays:
         """For ``size`` (B, M, K) and ``samples`` (ny, nx) on a pad."""
         (batch, count, most), (ny, nx) = size, samples
         self._markers = wp.zeros((batch, count), dtype=wp.vec2f, device=device)
-        self._table = wp.zeros((batch, most, _COLUMNS), dtype=wp.float32, device=device)
+        self._table = wp.zeros((batch, most, COLUMNS), dtype=wp.float64, device=device)
         self._boxes = wp.zeros(batch, dtype=wp.vec4i, device=device)
         self._depth = wp.zeros((batch, ny, -(-nx // PACKET)), dtype=packet, device=device)
         self.moved = wp.zeros((batch, count), dtype=wp.vec2f, device=device)
@@ -139,7 +136,7 @@ class FotsArrays:
         """Copy arrays of the host, as of ``FotsKernel.displacement``, to the device."""
         xy, table, edges, samples = self._host
         xy[:] = markers[..., :2]
-        table[:, : contacts.shape[1]] = contacts[..., :_COLUMNS]
+        table[:, : contacts.shape[1], : contacts.shape[2]] = contacts
         table[:, contacts.shape[1] :] = 0.0
         edges[:] = boxes
         samples.reshape(*samples.shape[:2], -1)[..., : self._columns] = depth
@@ -150,15 +147,17 @@ class FotsArrays:
     def launch(self, motion: MarkerMotionSpec) -> None:
         """Compute ``moved`` with the constants of ``motion``."""
         if self._motion is not motion:
-            constants = _constants(motion)
+            constants = constants_of(motion)
             for recorded in self._launches:
                 recorded.set_param_by_name("motion", constants)
             self._motion = motion
-        for recorded in self._launches:
-            recorded.launch()
+        with LAUNCH:
+            for recorded in self._launches:
+                recorded.launch()
 
 
-def _constants(motion: MarkerMotionSpec) -> Any:
+def constants_of(motion: MarkerMotionSpec) -> Any:
+    """Constants of a marker motion, for kernels."""
     result: Any = Constants()
     for name in ("dilate_gain", "dilate_lambda", "shear_lambda", "shear_max", "twist_lambda", "twist_max"):
         setattr(result, name, getattr(motion, name))

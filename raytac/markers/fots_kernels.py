@@ -1,4 +1,4 @@
-"""Kernels of ``DeviceFots``: shear and twist that each contact keeps, then the displacement of every marker, one thread each.
+"""Kernels of FOTS: shear and twist that each contact keeps, then the displacement of every marker, one thread each.
 
 Formulas and sources are those of ``raytac.markers.fots``.
 """
@@ -14,12 +14,12 @@ import math
 
 import warp as wp
 
+from raytac.markers.contact_kernels import kept_shares
 from raytac.markers.contacts import TWIST_SLIP
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _TWIST_SLIP = wp.constant(wp.float32(TWIST_SLIP))
-_B = wp.constant(wp.float32(1.0 / TWIST_SLIP**2))
 _2_PI = wp.constant(wp.float32(2.0 / math.pi))
 _LIMIT_STEPS = 3
 """Newton steps of ``kept_shares``: to float32's rounding at any shear and twist (a test compares with bisection)."""
@@ -69,41 +69,30 @@ class Drag:
     """Of the disc with the ellipse's area [m]."""
 
 
-@wp.func
-def kept_shares(x: wp.float32, y: wp.float32) -> wp.vec2f:
-    """As ``raytac.markers.contacts.kept_shares``."""
-    gamma = wp.max(wp.max(x - 1.0, (y - 1.0) / _B), 0.0)
-    for _ in range(_LIMIT_STEPS):
-        p, q = 1.0 + gamma, 1.0 + _B * gamma
-        xp, yq = x / p, y / q
-        n = wp.sqrt(xp * xp + yq * yq)
-        gamma = gamma + n * n * wp.max(n - 1.0, 0.0) / wp.max(xp * xp / p + _B * yq * yq / q, 1e-12)
-    return wp.vec2f(1.0 / (1.0 + gamma), 1.0 / (1.0 + _B * gamma))
-
-
 @wp.kernel
-def limit(table: wp.array3d(dtype=wp.float32), motion: Constants, drags: wp.array2d(dtype=Drag)):
+def limit(table: wp.array3d(dtype=wp.float64), motion: Constants, drags: wp.array2d(dtype=Drag)):
     """Shear and twist that each contact (B, K) gives to the skin; ``table``: as ``Contacts.table``."""
     b, k = wp.tid()
     m = motion
     drag = Drag()
-    drag.active = table[b, k, 0] + 0.0
-    shear, twist = wp.vec2f(table[b, k, 3], table[b, k, 4]), table[b, k, 5] + 0.0
+    drag.active = wp.float32(table[b, k, 0])
+    shear, twist = wp.vec2f(wp.float32(table[b, k, 3]), wp.float32(table[b, k, 4])), wp.float32(table[b, k, 5])
     length = wp.length(shear)
-    xx, xy, yy, depth = table[b, k, 6] + 0.0, table[b, k, 7] + 0.0, table[b, k, 8] + 0.0, table[b, k, 9] + 0.0
+    xx, xy, yy = wp.float32(table[b, k, 6]), wp.float32(table[b, k, 7]), wp.float32(table[b, k, 8])
+    depth = wp.float32(table[b, k, 9])
     drag.ellipse = wp.vec3f(xx, xy, yy)
     drag.radius = wp.sqrt(wp.sqrt(wp.max(xx * yy - xy * xy, 1e-24)))
     if m.is_punch == 1:
         shear_max, twist_max = m.slip * depth * drag.radius, _TWIST_SLIP * m.slip * depth
-        shares = kept_shares(length / wp.max(shear_max, 1e-12), wp.abs(twist) / wp.max(twist_max, 1e-12))
-        shear, twist = shares[0] * shear, shares[1] * twist
+        sheared, turned = kept_shares(length / wp.max(shear_max, 1e-12), wp.abs(twist) / wp.max(twist_max, 1e-12), _LIMIT_STEPS)
+        shear, twist = sheared * shear, turned * twist
     else:
         shear = shear * wp.min(1.0, m.shear_max / wp.max(length, 1e-12))
         twist = wp.clamp(twist, -m.twist_max, m.twist_max)
     half = wp.sin(0.5 * twist)
     drag.shear = shear
     drag.turn = wp.vec2f(-2.0 * half * half, wp.sin(twist))  # cos − 1 without cancellation
-    drag.centre = wp.vec2f(table[b, k, 1], table[b, k, 2]) - shear
+    drag.centre = wp.vec2f(wp.float32(table[b, k, 1]), wp.float32(table[b, k, 2])) - shear
     drags[b, k] = drag
 
 

@@ -13,7 +13,8 @@ from raytac.errors import InputError
 from raytac.gel.contact_shear import ContactShear
 from raytac.gel.surface import GelSurface, PadGrid, chosen_envs, summary
 from raytac.markers.base import MarkersConfig
-from raytac.markers.contacts import ContactCells, ContactTracker
+from raytac.markers.contact_tracker import ContactTracker
+from raytac.markers.contacts import ContactCells
 from raytac.markers.pattern import MarkerPattern
 from raytac.markers.perturbation import MarkerPerturbation, Perturber
 from raytac.markers.registry import markers_config
