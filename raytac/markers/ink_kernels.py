@@ -44,7 +44,7 @@ def print_dots(
 
 
 class DeviceInk:
-    """Coverage of the surfaces of B pads by round dots, as ``dot_ink`` describes it."""
+    """Coverage of the surfaces of B pads by round dots, which ``dot_ink`` describes."""
 
     def __init__(self, grid: PadGrid, radius: float, *, num_envs: int, device: str = "cpu") -> None:
         """``grid``: nodes of the pads; ``radius`` of a dot [m]."""

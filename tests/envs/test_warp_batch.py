@@ -106,6 +106,7 @@ def test_markers_are_those_of_the_host() -> None:
     assert np.abs(both.host.observers["sensor"].last()["markers"]).max() > 0.02  # the pad is pressed
 
 
+@pytest.mark.renderer
 def test_every_modality_is_that_of_the_host() -> None:
     """With the history that a stack keeps, images with the markers' dots, and the difference to rest."""
     seen = ObservationSettings(MODALITIES, resolution=(32, 24), optics="phong", map_shape=(6, 8), stack=2, difference=True)
