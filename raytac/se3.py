@@ -98,10 +98,11 @@ def quaternion(r: np.ndarray) -> np.ndarray:
     return q / np.sqrt(np.square(q).sum(axis=-1, keepdims=True))
 
 
-def inverse(poses: np.ndarray) -> np.ndarray:
-    """Inverses of rigid transforms (…, 4, 4)."""
-    result = np.zeros_like(poses)
-    transposed = np.swapaxes(poses[..., :3, :3], -1, -2)
+def inverse(poses: Any) -> Any:
+    """Inverses of rigid transforms (…, 4, 4); arrays of NumPy or PyTorch."""
+    xp = array_namespace(poses)
+    result = xp.zeros_like(poses)
+    transposed = poses[..., :3, :3].mT
     result[..., :3, :3] = transposed
     result[..., :3, 3] = -(transposed @ poses[..., :3, 3, None])[..., 0]
     result[..., 3, 3] = 1.0

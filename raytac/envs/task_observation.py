@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import numpy as np
 from array_api_compat import array_namespace
 
 from raytac.envs.task_rules import Array
+from raytac.observe import ArraySpec, TactileObserver
 
 _LENGTH, _SPEED = 0.1, 1.0
 """Scales of positions [m] and speeds [m/s, rad/s]."""
@@ -34,3 +38,21 @@ def body_from_tool(tool: Array, body: Array, speed: Array) -> Array:
     xp = array_namespace(tool)
     place = (body[:, :3, 3] - tool[:, :3, 3]) / _LENGTH
     return xp.astype(xp.concat([place, body[:, :3, 0], body[:, :3, 1], speed / _SPEED], axis=1), xp.float32)
+
+
+def observation_arrays(
+    actions: int, *, has_grip: bool, body_seen: bool, observers: Mapping[str, TactileObserver]
+) -> dict[str, ArraySpec]:
+    """Shape, type and bounds of every observation of one environment: ``state``, ``goal``, perhaps ``body``, ``<sensor>_<modality>``.
+
+    Args:
+        actions: size of an action.
+        has_grip: there is a gap between two pads.
+        body_seen: the body is observed.
+        observers: of the sensors by name.
+    """
+    sizes = {"state": 9 + has_grip + actions, "goal": 3} | ({"body": 15} if body_seen else {})
+    specs = {name: ArraySpec((n,), np.float32, -np.inf, np.inf) for name, n in sizes.items()}
+    for name, observer in observers.items():
+        specs |= {f"{name}_{modality}": spec for modality, spec in observer.arrays.items()}
+    return specs

@@ -322,3 +322,10 @@ class CellMeans:
         summed = np.add.reduceat(values, self._starts[0], axis=1, dtype=float)
         summed = np.add.reduceat(summed, self._starts[1], axis=2)
         return summed / (self._counts[0][:, None] * self._counts[1])
+
+    def matrices(self) -> tuple[np.ndarray, np.ndarray]:
+        """Matrices P (rows, Ny) and Q (Nx, columns) with which the means are P v Q."""
+        p, q = (
+            (np.repeat(np.arange(len(count)), count) == np.arange(len(count))[:, None]) / count[:, None] for count in self._counts
+        )
+        return p, q.T

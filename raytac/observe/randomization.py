@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
+from array_api_compat import array_namespace, device
 
 from raytac.checks import is_number
 from raytac.errors import InputError
@@ -136,6 +138,21 @@ def randomised_bodies(scene: TaskScene, randomization: Randomization, seed: int)
     return replace(scene, bodies=tuple(bodies))
 
 
+def response_curves(draws: Any, randomization: Randomization, gamma: float) -> Any:
+    """8-bit values of n cameras by value of the nominal one, (n, 3, 256); arrays of NumPy or PyTorch.
+
+    Args:
+        draws: uniform random numbers (n, 5) in [−1, 1): exposure, white balance of three channels, exponent.
+        randomization: half widths.
+        gamma: exponent of the nominal camera.
+    """
+    xp, r = array_namespace(draws), randomization
+    gain = (1.0 + r.exposure * draws[:, :1]) * (1.0 + r.white_balance * draws[:, 1:4])
+    exponent = gamma * (1.0 + r.gamma * draws[:, 4])
+    level = xp.arange(256, dtype=draws.dtype, device=device(draws)) / 255.0
+    return 255.0 * (gain[:, :, None] * level**gamma) ** (1.0 / exponent[:, None, None])
+
+
 class CameraDrift:
     """Cameras of B environments, each with its own exposure, white balance, exponent and noise.
 
@@ -156,12 +173,9 @@ class CameraDrift:
 
     def reset(self, envs: range | list[int]) -> None:
         """Draw the cameras of environments."""
-        r, level = self._settings, np.arange(256) / 255.0
-        for b in envs:
-            draw = self._streams[b].uniform(-1.0, 1.0, 5)
-            gain = (1.0 + r.exposure * draw[0]) * (1.0 + r.white_balance * draw[1:4])
-            exponent = self._gamma * (1.0 + r.gamma * draw[4])
-            self._curves[b] = 255.0 * (gain[:, None] * level**self._gamma) ** (1.0 / exponent)
+        if len(envs):
+            draws = np.stack([self._streams[b].uniform(-1.0, 1.0, 5) for b in envs])
+            self._curves[list(envs)] = response_curves(draws, self._settings, self._gamma)
 
     def apply(self, images: np.ndarray, *, noise: bool = True, envs: Sequence[int] | None = None) -> np.ndarray:
         """8-bit images (n, H, W, 3) of these cameras; ``noise``: add the noise of a frame.

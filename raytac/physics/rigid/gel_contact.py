@@ -67,6 +67,7 @@ class GelContact:
         shear: of the gels.
         faces: beyond which no body may be.
         chosen: environments of this step, as ``choose`` named them.
+        numbers: ``Differences`` of the environments, on the device.
     """
 
     def __init__(
@@ -100,12 +101,12 @@ class GelContact:
         ahead = _AHEAD * min((gel.thickness for gel in gels), default=0.0)
         self.search = PadSearch(gels, bodies.parts, num_envs=num_envs, ahead=ahead, device=device)
         self._gels, self._touched = _gels(gels, bodies, self.device), _touched(bodies, self.device)
-        self._numbers: Any = world.Differences()
+        self.numbers: Any = world.Differences()
         self._given = dict(numbers)
         for name, values in numbers.items():
             given = wp.array(values, dtype=wp.float64, device=self.device, copy=not self.device.is_cpu)
-            setattr(self._numbers, name, given)
-        self._numbers.carrier = _array(np.concatenate([bodies.index, bodies.carrier]), wp.int32, self.device)
+            setattr(self.numbers, name, given)
+        self.numbers.carrier = _array(np.concatenate([bodies.index, bodies.carrier]), wp.int32, self.device)
         all_pads, bodies_of, slots = (num_envs, pads), (num_envs, pads, count), (num_envs, pads, count + pads)
         self.frames = self._struct(Frames(), (num_envs, pads + count), _FRAMES)
         self.motion = self._struct(world.Motion(), slots, _MOTION)
@@ -142,7 +143,7 @@ class GelContact:
         for search, pad, body in self._pairs:
             poses = [self.motion, self.steps, pad, body, *self._clock, search.poses, search.reach]
             self._launch(pair_of_gels, (), poses)
-        shared = [self._numbers, self._gels, self._touched]
+        shared = [self.numbers, self._gels, self._touched]
         for search, *at in self._searches:
             search.launch()
             results = [search.rows, search.near, search.ends, *search.poses.shape[1:], *at]
@@ -207,7 +208,7 @@ class GelContact:
         """Take over what has changed in the arrays of ``numbers``; on the CPU that is done already."""
         if not self.device.is_cpu:
             for name, values in self._given.items():
-                getattr(self._numbers, name).assign(values)
+                getattr(self.numbers, name).assign(values)
 
     def _launch(self, kernel: Any, rest: tuple[int, ...], inputs: Sequence[Any]) -> None:
         """``rest``: threads along the axes after that of environments."""
