@@ -30,6 +30,7 @@ from raytac.world.engine.c_kernels import (
     write_regularisation,
 )
 from raytac.world.environment_models import EnvironmentModels
+from raytac.world.hard_contacts import box_sizes
 from raytac.world.implicit_damping import ImplicitDamping
 from raytac.world.pad_contact import PadIndices, last_dofs
 from raytac.world.world_state import lost
@@ -100,7 +101,7 @@ class CMujoco:
             for kernel, more in (
                 (write_contacts, [gels, others]),
                 (write_regularisation, []),
-                (write_references, [_array(pads.hard)]),
+                (write_references, [_array(pads.hard), wp.array(box_sizes(model), dtype=wp.vec3d, device="cpu")]),
                 (correct_lifts, []),
             )
         )
@@ -270,6 +271,7 @@ def _blank() -> mujoco.MjContact:
 _POINTERS = (
     "contact", "qpos", "qvel", "xpos", "xmat", "site_xpos", "site_xmat", "subtree_com", "cvel", "cdof", "qacc_smooth", "qacc",
     "qacc_warmstart", "efc_J_rownnz", "efc_J_rowadr", "efc_J_colind", "efc_J", "efc_D", "efc_R", "efc_vel", "efc_aref", "efc_force",
+    "geom_xpos", "geom_xmat",
 )  # fmt: skip
 _DOUBLES = ("dist", "pos", "frame", "friction", "mu")
 _INTEGERS = ("dim", "geom1", "geom2", "geom", "efc_address")

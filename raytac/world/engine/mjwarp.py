@@ -24,6 +24,7 @@ from raytac.robots.states import Numbers, body_pose, site_pose
 from raytac.warp_runtime import start_warp
 from raytac.world.engine import mjwarp_kernels as kernels
 from raytac.world.environment_models import EnvironmentModels
+from raytac.world.hard_contacts import box_sizes
 from raytac.world.implicit_damping import ImplicitDamping
 from raytac.world.pad_contact import PadIndices, last_dofs
 from raytac.world.world_state import LARGEST_SPEED
@@ -123,6 +124,7 @@ class MujocoWarp:
             self._sites, self._bodies, self._last = (_array(values) for values in (pads.sites, bodies, last_dofs(model, bodies)))
             self._share = wp.array(damping.share, dtype=wp.float64)
             self._others, self._hard = _array(pads.geoms), _array(pads.hard)
+            self._boxes = wp.array(box_sizes(model), dtype=wp.vec3)
             self._gels = _array(pads.geoms[len(pads.bodies) :])
         self._models = [models[0]] * num_envs
         self._take_models()
@@ -206,7 +208,7 @@ class MujocoWarp:
             wp.copy(own.first, self.data.nacon)
             self._launch(kernels.append_contacts, own.contact.shape, [worlds, steps, slots, self._gels, self._others, own])
             mjw.make_constraint(self.model, self.data)
-            hard = [worlds, own, self._hard, self.model.opt.timestep]
+            hard = [worlds, own, self._hard, self._boxes, self.model.opt.timestep]
             self._launch(kernels.write_hard_references, self.data.naconmax, hard)
             self._launch(kernels.write_rows, own.contact.shape, [worlds, steps, slots, own])
             for _ in range(_SLIDES):
@@ -414,6 +416,7 @@ def _array(values: np.ndarray) -> wp.array:
 
 _DATA = (
     "time", "qpos", "qvel", "act", "ctrl", "qacc", "qacc_smooth", "qacc_warmstart", "M", "xpos", "xmat", "site_xpos", "site_xmat",
+    "geom_xpos", "geom_xmat",
     "subtree_com", "cvel", "cdof", "nacon", "ncollision", "nefc", "overflow",
 )  # fmt: skip
 _CONTACT = (

@@ -30,6 +30,14 @@ _BACK = wp.constant(wp.float32(0.1))
 """Share of a penetration that a step takes back."""
 _FITS = wp.constant(wp.float64(0.005))
 """Error of a lift over the normal force that is left."""
+_BESIDE = wp.constant(wp.float32(1e-4))
+"""Distance from a box from which a point of a gap is not on it [m]."""
+_OPEN = wp.constant(wp.float32(2e-5))
+"""Gap that a contact without friction has before and after a step [m]; what carries load is closed nearer than that."""
+_FAR = wp.constant(wp.float32(1.0))
+"""Gap that no step closes [m]."""
+_SLOWEST = wp.constant(wp.float32(1e-6))
+"""Least speed by which a gap is divided [m/s]."""
 _LARGEST_SPEED = wp.constant(wp.float32(LARGEST_SPEED))
 _IMPEDANCE = wp.constant(wp.float32(0.9))
 _CONSTRAINT = wp.constant(wp.int32(1))
@@ -62,6 +70,8 @@ class Worlds:
     xmat: wp.array2d(dtype=wp.mat33)
     site_xpos: wp.array2d(dtype=wp.vec3)
     site_xmat: wp.array2d(dtype=wp.mat33)
+    geom_xpos: wp.array2d(dtype=wp.vec3)
+    geom_xmat: wp.array2d(dtype=wp.mat33)
     subtree_com: wp.array2d(dtype=wp.vec3)
     cvel: wp.array2d(dtype=wp.spatial_vector)
     cdof: wp.array2d(dtype=wp.spatial_vector)
@@ -348,26 +358,6 @@ def is_among(geoms: wp.array(dtype=wp.int32), geom: wp.int32) -> wp.int32:
     return geoms[geom]
 
 
-@wp.kernel
-def write_hard_references(worlds: Worlds, own: Own, hard: wp.array(dtype=wp.int32), timestep: wp.array(dtype=wp.float32)):
-    """Set the reference accelerations of MuJoCo's own contacts with geoms that are ``hard``."""
-    k = wp.tid()
-    if k >= wp.min(own.first[0], worlds.nacon[0]) or worlds.type[k] & _CONSTRAINT == 0 or worlds.dim[k] < 3:
-        return
-    geom, row = worlds.geom[k], worlds.efc_address[k, 0]
-    if row < 0 or is_among(hard, geom[0]) + is_among(hard, geom[1]) == 0:
-        return
-    i = worlds.worldid[k]
-    step, gap = timestep[i % timestep.shape[0]], worlds.dist[k]
-    # A gap is closed by the step exactly, and a penetration is taken back slowly.
-    wanted = wp.where(gap > wp.float32(0.0), gap, _BACK * gap) / step
-    worlds.aref[i, row] = -(worlds.vel[i, row] + wanted) / step
-    for m in range(1, 3):
-        other = worlds.efc_address[k, m]
-        if other >= 0:
-            worlds.aref[i, other] = -worlds.vel[i, other] / step
-
-
 @wp.func
 def row_times(worlds: Worlds, i: wp.int32, row: wp.int32, values: wp.array2d(dtype=wp.float32)) -> wp.float64:
     """A row of the constraint's Jacobian times a vector of the degrees of freedom."""
@@ -380,6 +370,75 @@ def row_times(worlds: Worlds, i: wp.int32, row: wp.int32, values: wp.array2d(dty
         for k in range(worlds.nv):
             result += wp.float64(worlds.J[i, row, k]) * wp.float64(values[i, k])
     return result
+
+
+@wp.func
+def is_box(boxes: wp.array(dtype=wp.vec3), geom: wp.int32) -> wp.bool:
+    """False of −1, which is a flex."""
+    if geom < 0:
+        return False
+    return boxes[geom][0] > wp.float32(0.0)
+
+
+@wp.func
+def beside_box(worlds: Worlds, i: wp.int32, geom: wp.int32, half: wp.vec3, point: wp.vec3) -> wp.float32:
+    """Distance [m] of a point from a box, along the axis on which it is farthest out; 0 inside."""
+    local = wp.transpose(worlds.geom_xmat[i, geom]) * (point - worlds.geom_xpos[i, geom])
+    out = wp.max(wp.abs(local[0]) - half[0], wp.abs(local[1]) - half[1])
+    return wp.max(out, wp.max(wp.abs(local[2]) - half[2], wp.float32(0.0)))
+
+
+@wp.func
+def passes(
+    worlds: Worlds, i: wp.int32, geom: wp.vec2i, boxes: wp.array(dtype=wp.vec3), near: wp.vec3, far: wp.vec3, moved: wp.vec3
+) -> wp.bool:
+    """As of ``c_kernels``."""
+    one, two = boxes[geom[0]], boxes[geom[1]]
+    off = wp.max(beside_box(worlds, i, geom[0], one, near), beside_box(worlds, i, geom[1], two, far))
+    by = wp.min(beside_box(worlds, i, geom[0], one, far + moved), beside_box(worlds, i, geom[1], two, near - moved))
+    return wp.max(off, by) > _BESIDE
+
+
+@wp.kernel
+def write_hard_references(
+    worlds: Worlds, own: Own, hard: wp.array(dtype=wp.int32), boxes: wp.array(dtype=wp.vec3), timestep: wp.array(dtype=wp.float32)
+):
+    """Set the reference accelerations of MuJoCo's own contacts with geoms that are ``hard``.
+
+    ``boxes``: half edges of geoms that are boxes, else 0.
+    """
+    k = wp.tid()
+    if k >= wp.min(own.first[0], worlds.nacon[0]) or worlds.type[k] & _CONSTRAINT == 0 or worlds.dim[k] < 3:
+        return
+    geom, row = worlds.geom[k], worlds.efc_address[k, 0]
+    if row < 0 or is_among(hard, geom[0]) + is_among(hard, geom[1]) == 0:
+        return
+    i = worlds.worldid[k]
+    step, gap = timestep[i % timestep.shape[0]], worlds.dist[k]
+    # A gap is closed by the step exactly, and a penetration is taken back slowly.
+    wanted = wp.where(gap > wp.float32(0.0), gap, _BACK * gap) / step
+    open = wp.bool(False)
+    ahead, free = wp.vec3(), wp.vec3()
+    if gap > wp.float32(0.0):
+        for m in range(3):
+            other = worlds.efc_address[k, m]
+            if other >= 0:
+                free[m] = wp.float32(row_times(worlds, i, other, worlds.qacc_smooth))
+                ahead[m] = worlds.vel[i, other] + step * free[m]
+        open = gap > _OPEN and gap + step * ahead[0] > _OPEN
+        if is_box(boxes, geom[0]) and is_box(boxes, geom[1]):
+            frame = worlds.frame[k]
+            shift = wp.float32(0.5) * gap * frame[0]
+            until = wp.min(step, gap / wp.max(-ahead[0], _SLOWEST))
+            moved = wp.transpose(frame) * wp.vec3(-gap, until * ahead[1], until * ahead[2])
+            if passes(worlds, i, geom, boxes, worlds.pos[k] - shift, worlds.pos[k] + shift, moved):
+                wanted, open = _FAR / step, wp.bool(True)
+    worlds.aref[i, row] = -(worlds.vel[i, row] + wanted) / step
+    for m in range(1, 3):
+        other = worlds.efc_address[k, m]
+        if other >= 0:
+            # MuJoCo's cone acts across a gap that is smaller than the friction times the slide of the step.
+            worlds.aref[i, other] = wp.where(open, free[m], -worlds.vel[i, other] / step)
 
 
 @wp.kernel
