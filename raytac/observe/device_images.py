@@ -1,4 +1,4 @@
-"""Observed images of many pads that stay on the device, for a solver and a learner on the same device."""
+"""Observed images of many pads, for a solver and a learner on one device."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from raytac.sensor import TactileSensor
 
 
 class DeviceImages:
-    """The ``rgb`` of a ``TactileObserver``, from heights on the device to an image on the device.
+    """The ``rgb`` of a ``TactileObserver``, from heights on a device to images on it.
 
     .. code-block:: python
 
@@ -55,7 +55,9 @@ class DeviceImages:
         return self._image.upload(surface)
 
     def observe(self, heights: Any, contact: Any = None) -> dict[str, Any]:
-        """``rgb`` (B, height, width, 3), uint8, on the device; ``as_tensors`` makes it a PyTorch tensor without a copy.
+        """``rgb`` (B, height, width, 3), uint8, on the device.
+
+        ``as_tensors`` makes it a PyTorch tensor without a copy.
 
         Args:
             heights: [m], B·Ny·Nx of them on the device, finite, which is not checked: a Dr.Jit array or a float32 PyTorch tensor.

@@ -237,7 +237,7 @@ class DeviceMode(ABC):
         return result
 
     def _finish(self) -> None:
-        """Wait for the call that is under way, if there is one; its images are copied back if anybody may ask for them."""
+        """Wait for the images under way; copy them back if anybody may ask for them."""
         if not self._is_running:
             return
         last, self._is_running = self._last(), False
@@ -359,7 +359,10 @@ class DeviceMode(ABC):
 
 
 class _Launched:
-    """Images that one thread has launched, waited for and copied back once; another thread renders them again."""
+    """Images that the launching thread waits for and copies back once.
+
+    Another thread renders them again.
+    """
 
     def __init__(self, wait: Callable[[], OpticsImages], again: Callable[[], OpticsImages]) -> None:
         self._wait, self._again, self._caller = wait, again, threading.get_ident()
