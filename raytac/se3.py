@@ -47,11 +47,7 @@ def pose_error(world_from_a: np.ndarray, world_from_b: np.ndarray) -> np.ndarray
 
 
 def shifted_wrench(wrench: np.ndarray, arm: np.ndarray) -> np.ndarray:
-    """Wrenches (…, 6) about another point.
-
-    Args:
-        arm: from that point to the one that the wrenches are about, (…, 3) [m].
-    """
+    """Wrenches (…, 6) about another point; ``arm`` (…, 3) [m] goes from it to the old one."""
     return np.concatenate([wrench[..., :3], wrench[..., 3:] + np.cross(arm, wrench[..., :3])], axis=-1)
 
 
@@ -147,10 +143,7 @@ def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
 
 
 def rotations(vectors: Any) -> Any:
-    """Rotation matrices (…, 3, 3) of rotation vectors (…, 3) [rad], of NumPy or PyTorch.
-
-    Rodrigues' formula.
-    """
+    """Rotation matrices (…, 3, 3) of vectors (…, 3) [rad] (Rodrigues), NumPy or PyTorch."""
     xp = array_namespace(vectors)
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
     angle = xp.sqrt(x * x + y * y + z * z)

@@ -1,7 +1,4 @@
-"""Observations for a learner from sensor frames: spaces, batches, stacks, randomisation.
-
-Gymnasium is not needed.
-"""
+"""Observations for a learner from sensor frames, batched; Gymnasium is not needed."""
 
 import lazy_loader
 

@@ -309,10 +309,7 @@ class TactileObserver:
 
 
 class CellMeans:
-    """Means over (rows, columns) cells of values at nodes (B, Ny, Nx).
-
-    A node belongs to the cell that contains it.
-    """
+    """Means over (rows, columns) cells of values at nodes (B, Ny, Nx), each in one cell."""
 
     def __init__(self, nodes: tuple[int, int], cells: tuple[int, int]) -> None:
         """Raises ``InputError`` if there are more cells than nodes."""

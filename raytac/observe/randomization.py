@@ -46,9 +46,7 @@ class Randomization:
 
     For two bodies in contact MuJoCo uses the greater coefficient."""
     pad_shift: float = 0.0
-    """Shift of each pad on its mount along each axis of the pad frame [m].
-
-    The arm's control ignores it."""
+    """Shift of each pad on its mount along each pad axis [m]; the arm's control ignores it."""
     pad_turn: float = 0.0
     """Rotation of each pad on its mount: each component of a rotation vector, pad frame [rad]."""
     exposure: float = 0.0
@@ -103,10 +101,7 @@ class Randomization:
 
 
 def randomised_sensor(sensor: SensorSpec, randomization: Randomization, seed: int) -> SensorSpec:
-    """Sensor drawn by a seed; the same one if nothing of it varies.
-
-    A reflectance is at most 1.
-    """
+    """Sensor drawn by a seed, the same if nothing of it varies; reflectances are at most 1."""
     r = randomization
     if not r.changes_sensor:
         return sensor

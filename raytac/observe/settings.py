@@ -56,21 +56,15 @@ class ObservationSettings:
     downscale: int = 1
     """The image is rendered this many times as large along both sides and averaged."""
     difference: bool = False
-    """Make ``rgb`` (255 + image − image at rest) // 2.
-
-    That is 127 where nothing has changed and cannot overflow."""
+    """Make ``rgb`` (255 + image − image at rest) // 2: 127 where nothing changed, no overflow."""
     map_shape: tuple[int, int] = (32, 32)
-    """(rows, columns) of ``height``, ``indentation`` and ``contact``.
-
-    They are means over equal cells of the pad, no more than its grid has nodes."""
+    """(rows, columns) of ``height``, ``indentation``, ``contact``; at most the grid's nodes."""
     stack: int = 1
     """Number of last observations that are stacked, oldest first.
 
     Images are stacked in the channels, all else along a new first axis. After a reset all are the first one."""
     normalise: bool = True
-    """Divide by ``SCALES``; else SI units.
-
-    Images are 8-bit and contact is a ratio in both cases."""
+    """Divide by ``SCALES``; else SI units. Images stay 8-bit and contact a ratio."""
     scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
     """In place of those of ``SCALES``, by modality."""
     optics: str | OpticsConfig[Any] = "taxim"

@@ -95,9 +95,7 @@ def _require_llvm() -> None:
 
 
 RENDERER = RLock()
-"""Lock for whoever records, launches or waits for kernels.
-
-Dr.Jit keeps what it records in one place of the process."""
+"""Lock around recording, launching, waiting: Dr.Jit records in one place of the process."""
 
 
 @contextmanager

@@ -29,7 +29,7 @@ The text outlives ``MjSpec.compile``, ``to_xml`` and ``attach``, whose prefix it
 _IN_CODE = "made in code"
 """Text of a sensor that was mounted as a specification, which no file has."""
 _TOUCH_RADIUS = 3e-3
-"""Contact radius [m] and mass [kg] of MuJoCo's contact, as stiff as the gel there (a choice)."""
+"""Radius [m] and mass [kg] for which MuJoCo's contact is as stiff as the gel (a choice)."""
 _TOUCH_MASS = 0.05
 _FARTHEST, _HEAVIEST = 1.0, 5.0
 """Distance from the carrier [m] and mass [kg] of mistaken units; GelSights: 20 to 200 g."""

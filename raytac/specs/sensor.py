@@ -167,7 +167,7 @@ class CaseSpec:
     wall: float = 0.8e-3
     """Thickness of walls and back [m]. 0.8 mm is a guess, from the Mini's outside of 32 × 28 mm."""
     density: float = 1000.0
-    """Mean density of the case with its camera [kg/m³], a guess; the Mini without gel weighs 22 g."""
+    """Mean density of case and camera [kg/m³], a guess; the Mini without gel weighs 22 g."""
 
     def __post_init__(self) -> None:
         check_fields(vars(self), SENSOR_SCHEMA["case"], "case")

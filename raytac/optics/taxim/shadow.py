@@ -67,7 +67,9 @@ class ShadowCaster:
         return ShadowArrays(mi.Int32(ordered(values).ravel()), mi.UInt32(ends.astype(np.uint32).ravel()), mi.Int32(paths.ravel()))
 
     def _paths(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels along rays (n_dir, n_places, 4) int32, and places before step s (n_dir, max_length + 1), from 1.
+        """Pixels of rays (n_dir, n_places, 4) int32, and how many lie before step s.
+
+        The numbers are (n_dir, max_length + 1), from 1.
 
         Rays of a fan pass the same pixels near their origin; each (step, pixel) is listed once, in the order of the steps.
         """
