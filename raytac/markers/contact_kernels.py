@@ -1,4 +1,4 @@
-"""Kernels of ``DeviceFots``: cells, connected contacts and their history, as ``ContactCells`` and ``ContactTracker`` have them."""
+"""Kernels of ``DeviceFots``: ``ContactCells`` and ``ContactTracker`` on the device."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -175,7 +175,7 @@ def detect(
     contacts: wp.array2d(dtype=Contact),
     most: wp.array(dtype=wp.int32),
 ):
-    """Contacts of every environment, 8-connected, in the order of their first cells, without history.
+    """Contacts of every environment, 8-connected, by their first cells, without history.
 
     ``box``: columns from, to and rows from, to of the cells in contact. ``most``: greatest number of contacts of an environment so far;
     those beyond the memory are left out.
@@ -273,7 +273,7 @@ def follow(
     # outputs
     table: wp.array3d(dtype=wp.float32),
 ):
-    """Add the object's motion since the last surface to the contacts that it carries on, or take the physics' shear.
+    """Add the object's motion to contacts that go on, or take the physics' shear.
 
     ``poses`` (B, pads, bodies + pads): ``pad_from_body``; ``depths`` (B, bodies): overlap of each with the pad, of which the deepest is
     the object.

@@ -1,4 +1,4 @@
-"""Separate contacts of every pad, and the drag and the turn of the object at each since first touch."""
+"""Contacts of every pad, and the object's drag and turn at each since first touch."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from raytac.gel.contact_shear import ContactShear
 from raytac.gel.surface import GelSurface, PadGrid, chosen_envs
 
 TWIST_SLIP = 3 * math.pi / 16
-"""Displacement at the edge of a contact when it spins over the shear when it slides, each at its limit of sticking.
+"""Displacement at a contact's edge when it spins over that when it slides, at the limits.
 
 Of a ball on incompressible rubber. Sliding, μ P = 8 G A Δs / (2 − ν); spinning, 3π/16 μ P A = 16/3 G A³ Δθ (Johnson, §3.6, 3.9); so
 9π/32 / (2 − ν)."""
@@ -29,15 +29,13 @@ class ContactSettings:
     """Sampling of contacts, and tracking from one surface to the next."""
 
     cell: float = 0.4e-3
-    """Largest side of a cell that a contact is averaged over [m], unless the pad's grid is coarser.
+    """Largest side of a cell that a contact is averaged over [m], unless the grid is coarser.
 
-    Gaps narrower than a cell do not separate two contacts. Marker motion is fitted with this size.
-    """
+    Gaps narrower than a cell do not separate two contacts. Marker motion is fitted with this size."""
     reach: float = 1e-3
-    """Distance from where the object's motion carries an earlier contact, beyond its radius, up to which a contact is that one [m].
+    """Distance [m] beyond a carried contact's radius within which a contact is that one.
 
-    It covers what a contact's centre moves by itself, as of a ball that rolls or an edge that comes down.
-    """
+    It covers what a contact's centre moves by itself, as of a ball that rolls or an edge that comes down."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -90,7 +88,7 @@ class ContactCells:
         return self.grid.rest.item(min(round((y - y0) / dy), ny - 1), min(round((x - x0) / dx), nx - 1))
 
     def sample(self, surface: GelSurface) -> ContactSamples:
-        """Average the indentation over the cells; an environment whose heights are not finite there has no contact."""
+        """Average the indentation over the cells; none where heights are not finite."""
         if surface.grid is not self.grid and surface.grid.shape != self.grid.shape:
             rule = f"must be that of the first surface, {self.grid.shape}"
             raise InputError("surface.grid", value=surface.grid.shape, rule=rule)
@@ -118,7 +116,7 @@ class ContactCells:
         return ContactSamples(self, depth, contact, (r0, r1, c0, c1))
 
     def _pooled(self, join: np.ufunc, values: np.ndarray, ny: int, nx: int) -> np.ndarray:
-        """Values (B, Ny, Nx) of nodes joined over ``ny`` × ``nx`` whole cells, of which the last may reach beyond the pad."""
+        """Node values (B, Ny, Nx) joined over ``ny`` × ``nx`` cells; the last may pass the edge."""
         kx, ky = self.nodes
         if kx == ky == 1:
             return values
@@ -135,7 +133,7 @@ class ContactSamples:
 
     cells: ContactCells
     depth: np.ndarray
-    """Mean of max(rest − height, 0) where the object touches, 0 where it does not [m], (B, ny, nx), float32."""
+    """Mean of max(rest − height, 0) in contact, else 0 [m], (B, ny, nx), float32."""
     contact: np.ndarray
     """True where the object touches the cell at all, (B, ny, nx), bool."""
     box: tuple[int, int, int, int]
@@ -143,7 +141,7 @@ class ContactSamples:
 
     @property
     def boxes(self) -> np.ndarray:
-        """Columns [c0, c1) and rows [r0, r1) that contain the contact of each environment, (B, 4), uint32; all 0 without contact."""
+        """Columns [c0, c1) and rows [r0, r1) of each contact, (B, 4), uint32; 0 without contact."""
         if len(self.contact) > 1:
             return contact_boxes(self.contact)
         r0, r1, c0, c1 = self.box
@@ -151,7 +149,7 @@ class ContactSamples:
 
 
 def _box_of(mask: np.ndarray) -> tuple[int, int, int, int]:
-    """Rows [r0, r1) and columns [c0, c1) that contain the True values of a mask (Ny, Nx); all 0 if there are none."""
+    """Rows [r0, r1) and columns [c0, c1) of the True values of a mask (Ny, Nx); 0 if none."""
     # A search in bytes, from either end, is several times faster than a reduction of the array.
     flat, width = mask.tobytes(), mask.shape[1]
     first = flat.find(1)
@@ -191,7 +189,7 @@ class Contacts:
 
     @property
     def shear(self) -> np.ndarray:
-        """Tangential displacement of the object at the contact since first touch, less known slip [m], (B, K, 2)."""
+        """Tangential displacement of the object since first touch, less known slip [m], (B, K, 2)."""
         return self.table[..., 3:5]
 
     @property
@@ -244,19 +242,19 @@ _NO_CONTACT = (0.0,) * 12
 
 
 class ContactTracker:
-    """Detects the contacts of each surface in turn and sums up the object's motion at each of them.
+    """Contacts of each surface in turn, with the object's motion summed at each.
 
     A contact is a connected component of the contact mask. From one surface to the next the object moves by D = T_now T_before⁻¹ (pad
     frame). A contact at G, on the pressed gel, adds (D G − G)_xy to its shear and D's rotation about z to its twist. This is the motion
     of the object's material where it touches, which is zero in rolling. A contact is an earlier one if it lies where D carries that one,
     to within its radius and ``ContactSettings.reach``; otherwise it is new and starts from zero. Without contact the history is dropped.
 
-    With ``slip`` c, what exceeds Δs_max = c h̄ A and Δθ_max = ``TWIST_SLIP`` c h̄ slips and is forgotten, so a reversal unloads first. The
-    shear that the physics knows takes the place of the history of the contact that it belongs to.
+    With ``slip`` c, what exceeds Δs_max = c h̄ A and Δθ_max = ``TWIST_SLIP`` c h̄ slips and is forgotten, so a reversal unloads first.
+    The shear that the physics knows takes the place of the history of the contact that it belongs to.
     """
 
     def __init__(self, batch: int, settings: ContactSettings | None = None, *, slip: float | None = None) -> None:
-        """For ``batch`` environments; ``settings``: None is the default ones; ``slip`` [1/m]: None never slips."""
+        """``settings``: None is the default; ``slip`` [1/m]: None never slips."""
         self.batch, self._reach, self._slip = batch, (settings or ContactSettings()).reach, slip
         self._contacts: list[list[_Contact]] = [[] for _ in range(batch)]
         self._pose: list[_Pose | None] = [None] * batch
@@ -270,7 +268,7 @@ class ContactTracker:
     def update(
         self, surface: GelSurface, samples: ContactSamples, envs: Sequence[int] | None = None, shear: ContactShear | None = None
     ) -> Contacts:
-        """Contacts of ``surface``, whose ``samples`` are given; arguments and errors as of ``MarkerTracker.update``."""
+        """Contacts of ``surface``; arguments and errors as of ``MarkerTracker.update``."""
         chosen = range(self.batch) if envs is None else envs
         if surface.batch != len(chosen):
             raise InputError("surface", value=surface.batch, rule=f"must have {len(chosen)} environments, as this tracker")
@@ -317,7 +315,7 @@ class ContactTracker:
 
 
 def _slipped(moved: tuple[float, float, float], contact: _Contact, slip: float) -> tuple[float, float, float]:
-    """Shear and twist that a contact keeps: the closest point, in elastic energy, of the ellipsoid of sticking."""
+    """Shear and twist that a contact keeps: the energy's closest point of the ellipsoid."""
     radius = max(contact.xx * contact.yy - contact.xy**2, 1e-24) ** 0.25
     shear_max, twist_max = slip * contact.depth * radius, TWIST_SLIP * slip * contact.depth
     x, y = math.hypot(*moved[:2]) / max(shear_max, 1e-12), abs(moved[2]) / max(twist_max, 1e-12)
@@ -328,8 +326,9 @@ def _slipped(moved: tuple[float, float, float], contact: _Contact, slip: float) 
 
 
 def kept_shares(x: Any, y: Any, steps: int, sqrt: Callable[[Any], Any], larger: Callable[[Any, Any], Any]) -> tuple[Any, Any]:
-    """Shares of a shear and of a twist that stick, by both over their limits: those of the closest point of the ellipsoid, in energy.
+    """Shares of a shear and of a twist that stick, by both over their limits.
 
+    They are those of the closest point of the ellipsoid, in energy.
     Newton's method on 1 / √(x² + y²) = 1, which is a straight line in γ for b = 1, from where the larger of the two alone would be; b as
     in ``fots``. ``sqrt`` and ``larger``: of the numbers, which may be arrays.
     """
@@ -344,7 +343,10 @@ def kept_shares(x: Any, y: Any, steps: int, sqrt: Callable[[Any], Any], larger: 
 
 
 def _motion(before: _Pose | None, now: _Pose | None) -> tuple[float, ...]:
-    """D = T_now T_before⁻¹: rows of x and y, (xx, xy, xz, x, yx, yy, yz, y), and rotation about z; the identity if a pose is unknown."""
+    """Rows of x and y of D = T_now T_before⁻¹, and its rotation about z.
+
+    (xx, xy, xz, x, yx, yy, yz, y); the identity if a pose is unknown.
+    """
     if before is not None and now is not None:
         xx, xy, xz = (_dot(now[0], row) for row in before[:3])
         yx, yy, yz = (_dot(now[1], row) for row in before[:3])

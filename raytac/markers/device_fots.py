@@ -1,4 +1,4 @@
-"""FOTS markers of many pads on the CPU or on CUDA, without the host: contacts, their history, displacements."""
+"""FOTS markers of many pads without the host: contacts, history, displacements."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class DeviceFots:
         self._launch(contact_kernels.forget, len(self._box), [mask, self._before, self._pose, self._pressed])
 
     def check(self) -> None:
-        """Wait for the device. Raises ``InputError`` if a pad had more contacts than there is memory for."""
+        """Wait for the device. Raises ``InputError`` if a pad had more contacts than memory."""
         most = int(self._most.numpy()[0])
         if most > self._room:
             self._most.zero_()
