@@ -1,4 +1,4 @@
-"""``TaskBatch``: B environments of one task without Gymnasium, from actions to observations, rewards and ends."""
+"""``TaskBatch``: B environments of one task without Gymnasium, from actions to rewards."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class StepResult:
     """Terms of the reward by name."""
     success: np.ndarray
     failed: np.ndarray
-    """Environments whose physics broke down: truncated, with reward 0 and their last sound observation."""
+    """Environments whose physics broke down: truncated, reward 0, last sound observation."""
 
 
 class TaskBatch:
@@ -153,7 +153,7 @@ class TaskBatch:
 
     @property
     def tool(self) -> np.ndarray:
-        """Poses (B, 4, 4) of the tool after the last step; an environment that failed keeps its last one."""
+        """Poses (B, 4, 4) of the tool after the last step; a failed environment keeps its last."""
         return self._tool.copy()
 
     @property
@@ -184,7 +184,7 @@ class TaskBatch:
     # --- episodes --------------------------------------------------------------------------------------------------------------
 
     def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
-        """Seed the random streams of cameras, markers, bodies and mounts; the next ``reset`` draws from them."""
+        """Seed the streams of cameras, markers, bodies and mounts for the next ``reset``."""
         self._variations.reseed(envs, seeds)
         for i, (name, observer) in enumerate(self.observers.items()):
             sensor_seeds = [_sensor_seed(seed, i) for seed in seeds]
@@ -193,7 +193,7 @@ class TaskBatch:
                 self.world.sensors[name].marker_tracker.reseed(envs, sensor_seeds)
 
     def reset(self, envs: Sequence[int], rngs: Sequence[np.random.Generator]) -> dict[str, np.ndarray]:
-        """Begin episodes in environments, each with its own generator; returns the observation (B, …) of all environments."""
+        """Begin episodes in ``envs``, each with its generator; returns all observations (B, …)."""
         envs = list(envs)
         u = np.array([rng.random(self.task.draws) for _, rng in zip(envs, rngs, strict=True)]).reshape(len(envs), self.task.draws)
         starts = self.task.starts(u, self.start_tool, self.start_body)
@@ -279,9 +279,9 @@ class TaskBatch:
         return specs
 
     def _observe(self, which: np.ndarray, state: WorldState) -> dict[str, np.ndarray]:
-        """Observations of all environments; sensors are read in those of ``which`` (B,), the others keep their last reading.
+        """Observations of all environments; sensors are read in those of ``which`` (B,).
 
-        ``state``: present state of the world.
+        The others keep their last reading. ``state``: present state of the world.
         """
         result = state_and_goal(self._tool, self.start_tool, self._turn, self._speed, self._opening, self._action, self._goal)
         if self.body_seen:
@@ -312,12 +312,12 @@ class TaskBatch:
 
 
 def _sensor_seed(seed: int, sensor: int) -> int:
-    """Seed of a sensor of an environment; never that of a neighbouring environment, whose seed is the next number."""
+    """Seed of an environment's sensor; never a neighbour's, whose seed is the next number."""
     return seed + (sensor << 64)
 
 
 def task_pitch(observer: TactileObserver) -> float:
-    """Pitch [m] as fine as the images, if there are any, between the coarsest allowed one and ``_PITCH``."""
+    """Pitch [m] as fine as images, if any, between the coarsest allowed and ``_PITCH``."""
     if "rgb" not in observer.settings.modalities:
         return _PITCH
     return max(COARSEST_PITCH, min(_PITCH, *observer.sensor.camera.pitch_at(observer.layout.rendered)))
@@ -330,7 +330,7 @@ def task_settings(tactile: ObservationSettings | Sequence[str] | str | None) -> 
 
 
 class VariationSampler:
-    """Seeded variations of B environments, from one random stream an environment: its draws do not depend on B."""
+    """Seeded variations of B environments, one stream each: draws do not depend on B."""
 
     def __init__(
         self,

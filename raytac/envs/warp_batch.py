@@ -1,4 +1,4 @@
-"""``WarpBatch``: B environments of one task on MuJoCo Warp, from actions to observations, rewards and ends, all on one device."""
+"""``WarpBatch``: B environments of one task on MuJoCo Warp, all on one device."""
 
 # pyright: reportMissingImports=false
 # (PyTorch belongs to the extra "rl", which the tests do without.)
@@ -31,7 +31,10 @@ from raytac.world.warp_world import WarpWorld
 
 @dataclass(frozen=True)
 class WarpStep:
-    """Result of a step of B environments; tensors (B,) or (B, …). Where an episode has ended, the observation is the next one's first."""
+    """Result of a step of B environments; tensors (B,) or (B, …).
+
+    Where an episode has ended, the observation is the next one's first.
+    """
 
     observation: dict[str, torch.Tensor]
     reward: torch.Tensor
@@ -142,11 +145,11 @@ class WarpBatch:
 
     @property
     def wrench(self) -> dict[str, torch.Tensor]:
-        """Wrench (B, 6) on every sensor in the last step, pad frame [N, N m]; it is overwritten by the next."""
+        """Wrench (B, 6) on every sensor in the last step, pad frame [N, N m], until the next."""
         return {name: self._wrenches[:, k] for k, name in enumerate(self._names)}
 
     def reset(self, seed: int | None = None) -> dict[str, torch.Tensor]:
-        """Begin all episodes and return the observation; ``seed`` makes their starts, and all later ones, repeatable."""
+        """Begin all episodes; ``seed`` makes these and later starts repeatable."""
         if seed is not None:
             self._generator.manual_seed(seed)
         self._ended.fill_(True)
@@ -156,7 +159,7 @@ class WarpBatch:
             return self._observe()
 
     def step(self, actions: torch.Tensor) -> WarpStep:
-        """One control step of every environment; ``actions`` (B, size) are cut to [−1, 1], and NaN is 0.
+        """One control step; ``actions`` (B, size) are cut to [−1, 1], and NaN is 0.
 
         Raises:
             InputError: actions of another shape, or no ``reset`` before.

@@ -1,4 +1,4 @@
-"""``WarpTouch``: observations that the sensors of a ``WarpWorld`` make, as tensors on its device."""
+"""``WarpTouch``: sensors' observations of a ``WarpWorld``, as tensors on its device."""
 
 # pyright: reportMissingImports=false
 # (PyTorch belongs to the extra "rl", which the tests do without.)
@@ -20,7 +20,9 @@ ON_DEVICE = ("rgb", "markers", "wrench")
 
 
 class WarpTouch:
-    """Observations of all sensors of B environments, named and scaled as those of ``TactileObserver``.
+    """Observations of all sensors of B environments, as of ``TactileObserver``.
+
+    Names and scales are the same.
 
     Attributes:
         pads: surfaces and markers of every sensor by its name; empty where the wrench alone is observed.
@@ -106,7 +108,7 @@ class WarpTouch:
         return result
 
     def _rendered(self, name: str) -> torch.Tensor:
-        """Images (B, height, width, 3) of 8 bit; another library renders them, which must not begin before the heights are there."""
+        """8-bit images (B, height, width, 3) of another library, begun once the heights are there."""
         pad = self.pads[name]
         device = self._world.engine.device
         if device.is_cuda:
