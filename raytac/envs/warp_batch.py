@@ -1,4 +1,4 @@
-"""``WarpBatch``: B environments of one task on MuJoCo Warp, from actions to observations, rewards and ends, all on one device."""
+"""``WarpBatch``: B environments of one task on MuJoCo Warp, all on one device."""
 
 # pyright: reportMissingImports=false
 # (PyTorch belongs to the extra "rl", which the tests do without.)
@@ -33,7 +33,10 @@ from raytac.world.warp_world import WarpWorld
 
 @dataclass(frozen=True)
 class WarpStep:
-    """Result of a step of B environments; tensors (B,) or (B, …). Where an episode has ended, the observation is the next one's first."""
+    """Result of a step of B environments; tensors (B,) or (B, …).
+
+    Where an episode has ended, the observation is the next one's first.
+    """
 
     observation: dict[str, torch.Tensor]
     reward: torch.Tensor
@@ -173,7 +176,7 @@ class WarpBatch:
 
     @property
     def wrench(self) -> dict[str, torch.Tensor]:
-        """Wrench (B, 6) on every sensor in the last step, pad frame [N, N m]; it is overwritten by the next."""
+        """Wrench (B, 6) on every sensor in the last step, pad frame [N, N m], until the next."""
         return {name: self._wrenches[:, k] for k, name in enumerate(self._names)}
 
     def reset(self, seed: int | None = None) -> dict[str, torch.Tensor]:
@@ -187,7 +190,7 @@ class WarpBatch:
             return self._observe()
 
     def step(self, actions: torch.Tensor) -> WarpStep:
-        """One control step of every environment; ``actions`` (B, size) are cut to [−1, 1], and NaN is 0.
+        """One control step; ``actions`` (B, size) are cut to [−1, 1], and NaN is 0.
 
         Raises:
             InputError: actions of another shape, or no ``reset`` before.

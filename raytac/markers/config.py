@@ -16,7 +16,7 @@ from raytac.specs.sensor import SensorSpec
 
 @dataclass(frozen=True)
 class Fots(MarkersConfig):
-    """FOTS: dilation, shear and twist by closed forms, around a disc that sticks if the sensor's marker motion has a ``punch``."""
+    """FOTS in closed forms, around a disc that sticks where the marker motion has a ``punch``."""
 
     takes_punch: ClassVar[bool] = True
     follows_shear: ClassVar[bool] = True
@@ -39,7 +39,7 @@ class Fots(MarkersConfig):
 
 @dataclass(frozen=True)
 class FotsPublished(Fots):
-    """FOTS as published: Gaussians with one λ for all contacts, whether or not the sensor's marker motion has a ``punch``."""
+    """FOTS as published: Gaussians with one λ for all contacts; a ``punch`` is ignored."""
 
     takes_punch: ClassVar[bool] = False
     follows_shear: ClassVar[bool] = False
@@ -63,9 +63,9 @@ class Superposition(MarkersConfig):
 
     follows_shear: ClassVar[bool] = True
     level: str = "coarse"
-    """Level of the soft pad whose unit-load fields are used; their memory grows with the square of its vertices."""
+    """Level of the soft pad whose unit loads are used; memory grows with its vertices squared."""
     rounds: int = 8
-    """Most solutions a frame, after each of which vertices lose contact or slide; it bounds the time of a frame."""
+    """Most solutions a frame; after each, vertices lose contact or slide."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -80,7 +80,7 @@ class Superposition(MarkersConfig):
 
 @dataclass(frozen=True)
 class ForceField(MarkersConfig):
-    """Penalty forces at the markers themselves, scaled to displacements by the sensor's marker motion."""
+    """Penalty forces at the markers, scaled to displacements by the sensor's marker motion."""
 
     def build(self, sensor: SensorSpec, grid: PadGrid, *, num_envs: int, device: str) -> MarkerModel:
         from raytac.markers.force_field import ForceFieldModel

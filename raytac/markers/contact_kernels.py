@@ -183,7 +183,7 @@ def detect(
     contacts: wp.array2d(dtype=Contact),
     most: wp.array(dtype=wp.int32),
 ):
-    """Contacts of every environment, 8-connected, in the order of their first cells, without history.
+    """Contacts of every environment, 8-connected, by their first cells, without history.
 
     ``windows``: columns from, to and rows from, to, beyond which no cell is looked at; ``box``: the same of the cells in contact. ``most``:
     greatest number of contacts of an environment so far; those beyond the memory are left out.

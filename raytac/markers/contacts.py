@@ -13,7 +13,7 @@ from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
 
 TWIST_SLIP = 3 * math.pi / 16
-"""Displacement at the edge of a contact when it spins over the shear when it slides, each at its limit of sticking.
+"""Displacement at a contact's edge when it spins over that when it slides, at the limits.
 
 Of a ball on incompressible rubber. Sliding, μ P = 8 G A Δs / (2 − ν); spinning, 3π/16 μ P A = 16/3 G A³ Δθ (Johnson, §3.6, 3.9); so
 9π/32 / (2 − ν)."""
@@ -26,15 +26,13 @@ class ContactSettings:
     """Sampling of contacts, and tracking from one surface to the next."""
 
     cell: float = 0.4e-3
-    """Largest side of a cell that a contact is averaged over [m], unless the pad's grid is coarser.
+    """Largest side of a cell that a contact is averaged over [m], unless the grid is coarser.
 
-    Gaps narrower than a cell do not separate two contacts. Marker motion is fitted with this size.
-    """
+    Gaps narrower than a cell do not separate two contacts. Marker motion is fitted with this size."""
     reach: float = 1e-3
-    """Distance from where the object's motion carries an earlier contact, beyond its radius, up to which a contact is that one [m].
+    """Distance [m] beyond a carried contact's radius within which a contact is that one.
 
-    It covers what a contact's centre moves by itself, as of a ball that rolls or an edge that comes down.
-    """
+    It covers what a contact's centre moves by itself, as of a ball that rolls or an edge that comes down."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -82,7 +80,7 @@ class ContactCells:
         return self.grid.rest.astype(np.float32)
 
     def sample(self, surface: GelSurface) -> ContactSamples:
-        """Average the indentation over the cells; an environment whose heights are not finite there has no contact."""
+        """Average the indentation over the cells; none where heights are not finite."""
         if surface.grid is not self.grid and surface.grid.shape != self.grid.shape:
             rule = f"must be that of the first surface, {self.grid.shape}"
             raise InputError("surface.grid", value=surface.grid.shape, rule=rule)
@@ -110,7 +108,7 @@ class ContactCells:
         return ContactSamples(self, depth, contact, (r0, r1, c0, c1))
 
     def _pooled(self, join: np.ufunc, values: np.ndarray, ny: int, nx: int) -> np.ndarray:
-        """Values (B, Ny, Nx) of nodes joined over ``ny`` × ``nx`` whole cells, of which the last may reach beyond the pad."""
+        """Node values (B, Ny, Nx) joined over ``ny`` × ``nx`` cells; the last may pass the edge."""
         kx, ky = self.nodes
         if kx == ky == 1:
             return values
@@ -127,7 +125,7 @@ class ContactSamples:
 
     cells: ContactCells
     depth: np.ndarray
-    """Mean of max(rest − height, 0) where the object touches, 0 where it does not [m], (B, ny, nx), float32."""
+    """Mean of max(rest − height, 0) in contact, else 0 [m], (B, ny, nx), float32."""
     contact: np.ndarray
     """True where the object touches the cell at all, (B, ny, nx), bool."""
     box: tuple[int, int, int, int]
@@ -135,7 +133,7 @@ class ContactSamples:
 
     @property
     def boxes(self) -> np.ndarray:
-        """Columns [c0, c1) and rows [r0, r1) that contain the contact of each environment, (B, 4), uint32; all 0 without contact."""
+        """Columns [c0, c1) and rows [r0, r1) of each contact, (B, 4), uint32; 0 without contact."""
         if len(self.contact) > 1:
             return contact_boxes(self.contact)
         r0, r1, c0, c1 = self.box
@@ -143,7 +141,7 @@ class ContactSamples:
 
 
 def _box_of(mask: np.ndarray) -> tuple[int, int, int, int]:
-    """Rows [r0, r1) and columns [c0, c1) that contain the True values of a mask (Ny, Nx); all 0 if there are none."""
+    """Rows [r0, r1) and columns [c0, c1) of the True values of a mask (Ny, Nx); 0 if none."""
     # A search in bytes, from either end, is several times faster than a reduction of the array.
     flat, width = mask.tobytes(), mask.shape[1]
     first = flat.find(1)
@@ -183,7 +181,7 @@ class Contacts:
 
     @property
     def shear(self) -> np.ndarray:
-        """Tangential displacement of the object at the contact since first touch, less known slip [m], (B, K, 2)."""
+        """Tangential displacement of the object since first touch, less known slip [m], (B, K, 2)."""
         return self.table[..., 3:5]
 
     @property

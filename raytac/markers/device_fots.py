@@ -1,4 +1,4 @@
-"""FOTS markers of many pads on the CPU or on CUDA, without the host: contacts, their history, displacements."""
+"""FOTS markers of many pads without the host: contacts, history, displacements."""
 
 from __future__ import annotations
 

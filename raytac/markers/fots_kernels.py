@@ -22,7 +22,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 _TWIST_SLIP = wp.constant(wp.float32(TWIST_SLIP))
 _2_PI = wp.constant(wp.float32(2.0 / math.pi))
 _LIMIT_STEPS = 3
-"""Newton steps of ``kept_shares``: to float32's rounding at any shear and twist (a test compares with bisection)."""
+"""Newton steps of ``kept_shares``: to float32's rounding (a test compares bisection)."""
 _NEGLIGIBLE = wp.constant(wp.float32(16.0))
 """Exponent of a Gaussian beyond which it is neglected: float32 cannot add e⁻¹⁶ to 1."""
 
@@ -98,7 +98,7 @@ def limit(table: wp.array3d(dtype=wp.float64), motion: Constants, drags: wp.arra
 
 @wp.func
 def beyond_ellipse(x: wp.vec2f, t: wp.vec3f) -> wp.float32:
-    """r² − A² of a point ``x`` from the centre of the ellipse xᵀ T⁻¹ x = 1 with A² = √det T; 0 inside.
+    """r² − A² of a point ``x`` from the centre of xᵀ T⁻¹ x = 1, A² = √det T; 0 inside.
 
     The λ > 0 of the confocal ellipse xᵀ (T + λ)⁻¹ x = 1 through the point; these are the equipotentials of an elliptic disc, and
     λ = ‖x‖² − A² for a disc. λ² − b λ + c = 0 with b = ‖x‖² − tr T, c = det T − xᵀ adj(T) x.
@@ -152,7 +152,7 @@ def dragged(place: wp.vec2f, b: wp.int32, drags: wp.array2d(dtype=Drag), m: Cons
 
 @wp.func
 def first_cell(x: wp.float32, low: wp.int32, high: wp.int32) -> wp.int32:
-    """The first cell from ``low`` that is not before ``x``, in cells; ``high`` if there is none before it."""
+    """First cell from ``low`` that is not before ``x`` [cells]; at most ``high``."""
     return wp.int32(wp.clamp(wp.ceil(x), wp.float32(low), wp.float32(high)))
 
 
@@ -160,7 +160,7 @@ def first_cell(x: wp.float32, low: wp.int32, high: wp.int32) -> wp.int32:
 def dilated(
     place: wp.vec2f, b: wp.int32, box: wp.vec4i, depth: wp.array3d(dtype=wp.float32), cells: Cells, lam: wp.float32
 ) -> wp.vec2f:
-    """Σ Δh (M − C) exp(−λ ‖M − C‖²) over the cells of the contact's box that lie within reach of the marker.
+    """Σ Δh (M − C) exp(−λ ‖M − C‖²) over cells of the contact's box within a marker's reach.
 
     ``box``: columns from, to and rows from, to; a cell that nothing touches has a negative depth.
     """

@@ -113,7 +113,7 @@ def share_cores() -> None:
 
 
 RENDERER = RLock()
-"""Held by whoever records, launches or waits for kernels: Dr.Jit keeps what it records in one place of the process."""
+"""Lock around recording, launching, waiting: Dr.Jit records in one place of the process."""
 
 
 @contextmanager
@@ -134,12 +134,11 @@ def no_collection() -> Iterator[None]:
 
 
 def peak_bytes(call: Callable[[], object], device: str, *, calls: int = 3) -> int:
-    """Most bytes of Dr.Jit's arrays during one of ``calls`` runs of ``call``, beyond those before; 0 without Dr.Jit.
+    """Most bytes of Dr.Jit's arrays in one of ``calls`` runs of ``call``, beyond those before.
 
-    Kernels run beside the code that launches them, so memory that one frees may or may not be free in time for the next: only the
-    largest of several runs is the same from one process to another. The allocator's cache is emptied before each run, so that memory
-    kept from earlier work does not hide what the call needs; that makes the next calls slower. Acceleration structures of the ray
-    tracer (Embree, OptiX) are not Dr.Jit arrays and not counted.
+    It is 0 without Dr.Jit. Kernels run beside the code that launches them, so memory that one frees may or may not be free for the next:
+    only the largest of several runs is the same in every process. The allocator's cache is emptied before each run, which makes the next
+    calls slower. Acceleration structures of the ray tracer (Embree, OptiX) are not Dr.Jit arrays and not counted.
     """
     backend = dr.JitBackend.CUDA if device == "cuda" else dr.JitBackend.LLVM
     peak = 0

@@ -1,4 +1,4 @@
-"""Length of an environment's steps, in Warp: the scene's, halved until nothing moves too far in one near a pad.
+"""Length of an environment's steps: halved until nothing near a pad moves too far.
 
 Steps are Δt = T / 2^k of the scene's step T. One of 2^k ticks starts at a multiple of itself only, so that all end together at T.
 """
@@ -98,7 +98,7 @@ def approach(
     steps: Steps,
     slots: Slots,
 ):
-    """Slots of one search's results: the speed at which each closes, and the step that it allows.
+    """Slots of one search's results: the closing speed of each, and the step it allows.
 
     ``pads``, ``bodies``: of the search, which begin with ``first_pad``, ``first_body`` of the slots. What has no law has gone through the
     gel, as two gels that overlap by more than one of them: its environment is lost. Where the compliance is 0 neither body moves.
