@@ -298,7 +298,7 @@ class MujocoWarp:
         self._launch(kernels.write_controls, values.shape, [actuators, values, self.data.ctrl])
 
     def capture(self, step: Callable[[], None]) -> Callable[[], None]:
-        """What ``step`` launches, as one graph on CUDA, else ``step``, which runs once before."""
+        """Graph of what ``step`` launches on CUDA, else ``step``; ``step`` runs once before."""
         step()
         if self.device.is_cpu:
             return step
