@@ -33,10 +33,7 @@ from raytac.world.warp_world import WarpWorld
 
 @dataclass(frozen=True)
 class WarpStep:
-    """Result of a step of B environments; tensors (B,) or (B, …).
-
-    Where an episode has ended, the observation is the next one's first.
-    """
+    """Result of a step of B environments; tensors (B,) or (B, …). Where an episode has ended, the observation is the next one's first."""
 
     observation: dict[str, torch.Tensor]
     reward: torch.Tensor
@@ -161,7 +158,7 @@ class WarpBatch:
 
     @property
     def steps(self) -> torch.Tensor:
-        """Steps since the start of each episode, (B,), int64; writing to them ends episodes as much earlier."""
+        """Steps (B,), int64, since each episode's start; writing ends episodes as much earlier."""
         return self._progress.steps
 
     @property
@@ -190,7 +187,7 @@ class WarpBatch:
             return self._observe()
 
     def step(self, actions: torch.Tensor) -> WarpStep:
-        """One control step; ``actions`` (B, size) are cut to [−1, 1], and NaN is 0.
+        """One control step of every environment; ``actions`` (B, size) are cut to [−1, 1], and NaN is 0.
 
         Raises:
             InputError: actions of another shape, or no ``reset`` before.

@@ -98,7 +98,7 @@ class DeviceFots:
         self._launch(forget_object, len(self._pressed), [mask, self._pressed])
 
     def check(self) -> None:
-        """Wait for the device. Raises ``InputError`` if a pad had more contacts than there is memory for."""
+        """Wait for the device. Raises ``InputError`` if a pad had more contacts than memory."""
         self.contacts.check()
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:

@@ -1,4 +1,4 @@
-"""Kernels of FOTS: shear and twist that each contact keeps, then the displacement of every marker, one thread each.
+"""Kernels of FOTS: what each contact keeps, and the markers' displacements.
 
 Formulas and sources are those of ``raytac.markers.fots``.
 """
@@ -71,7 +71,7 @@ class Drag:
 
 @wp.kernel
 def limit(table: wp.array3d(dtype=wp.float64), motion: Constants, drags: wp.array2d(dtype=Drag)):
-    """Shear and twist that each contact (B, K) gives to the skin; ``table``: as ``Contacts.table``."""
+    """Shear and twist that each contact (B, K) gives to the coat; see ``Contacts.table``."""
     b, k = wp.tid()
     m = motion
     drag = Drag()

@@ -29,7 +29,7 @@ from raytac.physics.rigid.world_kernels import (
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _TRAVEL = wp.constant(wp.float64(0.05))
-"""Greatest share of the gel's thickness by which any place of a contact closes or opens in a step."""
+"""Most closing or opening of any place of a contact in a step, over the gel's thickness."""
 _SWING = wp.constant(wp.float64(0.02))
 """Share of the thickness from which a contact that swings on its own stiffness is resolved …"""
 _PHASE = wp.constant(wp.float64(0.1))
