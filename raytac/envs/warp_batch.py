@@ -173,7 +173,7 @@ class WarpBatch:
 
     @property
     def wrench(self) -> dict[str, torch.Tensor]:
-        """Wrench (B, 6) on every sensor in the last step, pad frame [N, N m], until the next."""
+        """Wrench (B, 6) [N, N m] on every sensor, pad frame; the next step overwrites it."""
         return {name: self._wrenches[:, k] for k, name in enumerate(self._names)}
 
     def reset(self, seed: int | None = None) -> dict[str, torch.Tensor]:

@@ -52,7 +52,7 @@ class WorldPads(Protocol):
         ...
 
     def advance(self, drive: Drive, failed: np.ndarray) -> None:
-        """One control step; environments that break down are marked in ``failed`` (B,) and stand."""
+        """One control step; environments that break down are in ``failed`` (B,) and stand still."""
         ...
 
     def wrench(self, name: str) -> np.ndarray:
