@@ -32,7 +32,6 @@ class World:
     Args:
         bodies: of unique names.
         settings: of the time step.
-        num_envs: number of environments, B.
         device: ``"cpu"``, ``"cuda"``, ``"cuda:1"`` or ``"auto"`` (CUDA if there is one).
         friction: μ by pair of body names, where it differs from ``settings.friction``.
         ignored: pairs of body names that pass through each other.
@@ -187,7 +186,6 @@ class World:
         """Positions [m] (B, n, 3) of all vertices of a soft body's mesh, or of another's surface.
 
         Args:
-            name: the body.
             frame: ``"world"``, or ``"body"`` for a bonded soft body in its own moving frame.
         """
         body = self._index(name)

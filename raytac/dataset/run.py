@@ -73,7 +73,6 @@ def render_dataset(
     shards only, and the same call goes on with the others.
 
     Args:
-        plan: what to render.
         folder: of the data set; made if need be.
         engine: one of ``ENGINES``: ``local``, in this process, or ``ray``.
         device: ``auto``, ``cpu`` or ``cuda``.

@@ -74,8 +74,6 @@ class TaskBatch:
         """Compose the world; ``reset`` begins the episodes.
 
         Args:
-            task: the task.
-            num_envs: number of environments B.
             physics, device: as of ``TactileWorld``.
             tactile: observation of every sensor: settings, or modalities alone; "task" takes those of the task; with None no sensor is
                 read and nothing of it is computed.

@@ -33,7 +33,6 @@ class TaskProgress:
         """Begin where the scene does.
 
         Args:
-            task: the task.
             tool, body: poses (B, 4, 4) in the scene, float64.
             steps: zeros (B,), whole numbers.
             actions: size k of an action.
@@ -77,8 +76,6 @@ class TaskProgress:
             wrench: on every sensor (B, 6), pad frame.
             opening: gap between two pads (B, 1) [m]; (B, 0) without a gripper.
             joint_speed: (B, n) [rad/s].
-            failed: environments (B,) whose physics broke down.
-            max_episode_steps: at which an episode is truncated.
         """
         state = TaskState(
             tool=self.tool,

@@ -27,7 +27,6 @@ class VariationRanges:
         """Name what varies.
 
         Args:
-            scene: scene whose bodies vary.
             sensors: names of the sensors whose gels and mountings vary.
             randomization: half widths; ``body_mass``, ``body_friction``, ``youngs_modulus``, ``friction``, ``pad_shift`` and ``pad_turn``
                 of it are used.
@@ -82,7 +81,6 @@ def on_mounted_pad(body: str, bodies: Mapping[str, Array], pad: Array, mounting:
     """Starts of bodies where ``body`` is shifted and tilted with the pad that it stands on.
 
     Args:
-        body: name of the body that stands on the pad.
         bodies: name to ``world_from_body`` (n, 4, 4).
         pad: pose (4, 4) of the pad as designed.
         mounting: ``nominal_from_pad`` (n, 4, 4).

@@ -35,11 +35,7 @@ class DeviceFots:
 
         Args:
             sensor: with markers and their motion.
-            config: of the model.
-            grid: nodes of the surfaces.
-            num_envs: number of pads B.
             patches: most separate contacts of a pad.
-            device: "cpu" or "cuda".
 
         Raises:
             InputError: another model, a perturbation, or a sensor without markers or their motion.

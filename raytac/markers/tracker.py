@@ -109,7 +109,6 @@ class MarkerTracker:
             grid: grid of the surfaces to come, of ``num_envs`` environments.
             resolution: (width, height) of the image that pixels refer to [px]; None is the sensor's own.
             device: ``auto``, ``cpu`` or ``cuda``, for models that can use it.
-            seed: seed of the perturbation.
 
         Raises:
             InputError: an unknown model, a sensor without markers or without the marker motion that the model needs, or a shift that

@@ -144,7 +144,6 @@ def response_curves(draws: Any, randomization: Randomization, gamma: float) -> A
 
     Args:
         draws: uniform random numbers (n, 5) in [−1, 1): exposure, white balance of three channels, exponent.
-        randomization: half widths.
         gamma: exponent of the nominal camera.
     """
     xp, r = array_namespace(draws), randomization

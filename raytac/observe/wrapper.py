@@ -44,7 +44,6 @@ class AddTactile(gymnasium.Wrapper):
         """Wrap ``env``.
 
         Args:
-            env: environment to wrap.
             observers: observer of each sensor, with one environment and without ``difference``.
             frames: function that returns the present frame of each sensor.
 

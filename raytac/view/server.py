@@ -201,7 +201,6 @@ def checked_message(raw: bytes | str, element: Callable[[str], Any]) -> bytes:
     """The same message encoded again, from nothing but what was understood of it.
 
     Args:
-        raw: as it came.
         element: the element of a uuid, with its ``value``, and ``options`` or ``min`` and ``max`` if these say what it can be; None if
             there is none (any more), which viser does not mind.
 

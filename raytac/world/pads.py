@@ -43,7 +43,6 @@ class WorldPads(Protocol):
         """Put environments back to the start, where MuJoCo's states are.
 
         Args:
-            envs: the environments.
             bodies: not None if bodies or the robot start elsewhere: name to poses (n, 4, 4).
 
         Raises:

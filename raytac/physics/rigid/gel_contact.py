@@ -87,14 +87,11 @@ class GelContact:
         """Make the arrays.
 
         Args:
-            gels, bodies: of the world.
             pairs: two gels that may touch, and the search for that.
             numbers: those of ``Differences`` that environments may change, (B, …); on the CPU the arrays themselves are read in every step,
                 on CUDA ``vary`` copies them again.
-            num_envs: B.
             timestep: the scene's step [s].
             case_travel: greatest travel of a body beside a case in a step [m].
-            device: "cpu" or "cuda".
         """
         start_warp()
         self.device = wp.get_device(device)

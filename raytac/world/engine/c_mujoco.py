@@ -58,7 +58,6 @@ class CMujoco:
         """Prepare the kernels.
 
         Args:
-            contact: the gels' contacts, on the CPU.
             pads: what the models call pads and what they touch.
             models: of the environments; a variation may replace one.
             datas: their states; ``bind`` names others.

@@ -73,7 +73,6 @@ class MujocoWarp:
         """Make the states, all at ``qpos0``.
 
         Args:
-            contact: the gels' contacts, on the device of all.
             pads: what the models call pads and what they touch.
             models: of the environments; a variation may replace one.
             timestep: of the scene's steps [s], which divide into shorter ones; None is the models'.
