@@ -137,8 +137,7 @@ class World:
 
         On CUDA every new ``dt`` costs a recording; take few different ones.
 
-        Raises:
-            IpcError: if ``dt`` is not positive.
+        Raises ``IpcError`` if ``dt`` is not positive.
         """
         if dt is not None and not 0.0 < dt < np.inf:
             raise IpcError(f"dt = {dt}: it must be positive")
@@ -280,8 +279,7 @@ class World:
 
         None where nothing touches its free nodes, as before any step. The first call for a body inverts its rest matrix.
 
-        Raises:
-            IpcError: no soft body with bonded vertices, or one too large or too ill-conditioned to be inverted.
+        Raises ``IpcError``: no soft body with bonded vertices, or one too large or too ill-conditioned to be inverted.
         """
         body = self._index(name)
         if not isinstance(self.bodies[body], SoftBody) or not self.layout.framed[body]:

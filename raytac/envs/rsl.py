@@ -96,8 +96,7 @@ class RslVecEnv(VecEnv):
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
         """Step all environments with actions (B, k), cut to [−1, 1]; those that end begin again.
 
-        Raises:
-            InputError: actions that are not finite; the message names the environment.
+        Raises ``InputError``: actions that are not finite; the message names the environment.
         """
         values = actions.detach().cpu().numpy()
         if not np.isfinite(values).all():

@@ -189,8 +189,7 @@ class WarpBatch:
     def step(self, actions: torch.Tensor) -> WarpStep:
         """One control step of every environment; ``actions`` (B, size) are cut to [−1, 1], and NaN is 0.
 
-        Raises:
-            InputError: actions of another shape, or no ``reset`` before.
+        Raises ``InputError``: actions of another shape, or no ``reset`` before.
         """
         if tuple(actions.shape) != (self.num_envs, self.size):
             raise InputError("actions", value=tuple(actions.shape), rule=f"must have shape {(self.num_envs, self.size)}")

@@ -24,8 +24,7 @@ def load_mitsuba(device: str = "auto") -> tuple[Any, str]:
     Returns the module and the device that it runs on. A process has one variant: types of Mitsuba plugins are bound to the first, and
     ``auto`` stays with it. The first ``cuda`` of a process traces one ray; where that fails, ``auto`` warns and takes the CPU.
 
-    Raises:
-        BackendError: no LLVM library or one too old (CPU), no CUDA that works, or a process that already uses the other variant.
+    Raises ``BackendError``: no LLVM library or one too old (CPU), no CUDA that works, or a process that already uses the other variant.
     """
     resolved = resolve_device(device)
     if resolved == "cpu":

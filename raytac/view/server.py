@@ -39,8 +39,7 @@ def guarded_server(host: str, port: int, addresses: PageAddresses) -> ViserServe
     are read (``create_connection``). So the two functions of viser that lead there run here as copies in which that one name means
     something else; viser's own modules stay as they are, and so do other servers in this process.
 
-    Raises:
-        BackendError: viser has changed so that the guard is not reached; nothing is served then.
+    Raises ``BackendError``: viser has changed so that the guard is not reached; nothing is served then.
     """
     import viser
     from viser import infra
