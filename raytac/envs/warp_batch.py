@@ -33,7 +33,10 @@ from raytac.world.warp_world import WarpWorld
 
 @dataclass(frozen=True)
 class WarpStep:
-    """Result of a step of B environments; tensors (B,) or (B, …). Where an episode has ended, the observation is the next one's first."""
+    """Result of a step of B environments; tensors (B,) or (B, …).
+
+    Where an episode has ended, the observation is the next one's first.
+    """
 
     observation: dict[str, torch.Tensor]
     reward: torch.Tensor
@@ -158,7 +161,7 @@ class WarpBatch:
 
     @property
     def steps(self) -> torch.Tensor:
-        """Steps (B,), int64, since each episode's start; writing ends episodes as much earlier."""
+        """Steps since the start of each episode, (B,), int64; writing to them ends episodes as much earlier."""
         return self._progress.steps
 
     @property
@@ -173,7 +176,7 @@ class WarpBatch:
 
     @property
     def wrench(self) -> dict[str, torch.Tensor]:
-        """Wrench (B, 6) [N, N m] on every sensor, pad frame; the next step overwrites it."""
+        """Wrench (B, 6) on every sensor in the last step, pad frame [N, N m], until the next."""
         return {name: self._wrenches[:, k] for k, name in enumerate(self._names)}
 
     def reset(self, seed: int | None = None) -> dict[str, torch.Tensor]:
@@ -187,9 +190,10 @@ class WarpBatch:
             return self._observe()
 
     def step(self, actions: torch.Tensor) -> WarpStep:
-        """One control step of every environment; ``actions`` (B, size) are cut to [−1, 1], and NaN is 0.
+        """One control step; ``actions`` (B, size) are cut to [−1, 1], and NaN is 0.
 
-        Raises ``InputError``: actions of another shape, or no ``reset`` before.
+        Raises:
+            InputError: actions of another shape, or no ``reset`` before.
         """
         if tuple(actions.shape) != (self.num_envs, self.size):
             raise InputError("actions", value=tuple(actions.shape), rule=f"must have shape {(self.num_envs, self.size)}")

@@ -58,9 +58,7 @@ class ObservationSettings:
     difference: bool = False
     """Make ``rgb`` (255 + image − image at rest) // 2: 127 where nothing changed, no overflow."""
     map_shape: tuple[int, int] = (32, 32)
-    """(rows, columns) of ``height``, ``indentation`` and ``contact``.
-
-    They are means over equal cells of the pad, no more than its grid has nodes."""
+    """(rows, columns) of ``height``, ``indentation``, ``contact``; at most the grid's nodes."""
     stack: int = 1
     """Number of last observations that are stacked, oldest first.
 
