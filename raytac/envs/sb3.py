@@ -54,7 +54,7 @@ class TactileVecEnv(_DictVecEnv):
     """
 
     def __init__(self, env: TactileVectorEnv) -> None:
-        """Wrap ``env``. Raises ``InputError`` for a vector that does not reset environments in the step in which they end."""
+        """Wrap ``env``; InputError unless it resets environments in the step that ends them."""
         mode = env.metadata["autoreset_mode"]
         if mode is not AutoresetMode.SAME_STEP:
             raise InputError("autoreset_mode", value=mode.value, rule="must be 'SameStep' for stable-baselines3")
@@ -74,7 +74,7 @@ class TactileVecEnv(_DictVecEnv):
         self._actions = actions
 
     def step_wait(self) -> Step:
-        """Step with the actions kept. Raises ``InputError``, naming the environment, for one that is not finite or out of bounds."""
+        """Step with the actions kept; InputError names an environment not finite or out of bounds."""
         return _vec_env_step(*self.env.step(self._actions))
 
 
