@@ -43,13 +43,12 @@ def body_from_tool(tool: Array, body: Array, speed: Array) -> Array:
 def observation_arrays(
     actions: int, *, has_grip: bool, body_seen: bool, observers: Mapping[str, TactileObserver]
 ) -> dict[str, ArraySpec]:
-    """Shape, type and bounds of every observation of one environment: ``state``, ``goal``, perhaps ``body``, ``<sensor>_<modality>``.
+    """Shape, type and bounds of every observation of one environment.
+
+    They are ``state``, ``goal``, perhaps ``body``, and ``<sensor>_<modality>``.
 
     Args:
-        actions: size of an action.
         has_grip: there is a gap between two pads.
-        body_seen: the body is observed.
-        observers: of the sensors by name.
     """
     sizes = {"state": 9 + has_grip + actions, "goal": 3} | ({"body": 15} if body_seen else {})
     specs = {name: ArraySpec((n,), np.float32, -np.inf, np.inf) for name, n in sizes.items()}

@@ -77,12 +77,12 @@ class WarpTouch:
             pad.launch(self._world.contact, self._world.engine.active)
 
     def forget(self, mask: wp.array) -> None:
-        """Launch that the pads of the environments of a mask (B,), bool, forget what they went through."""
+        """Launch that the pads of a mask (B,), bool, forget the past."""
         for pad in self.pads.values():
             pad.reset(mask)
 
     def begin(self, mask: torch.Tensor) -> None:
-        """Begin episodes in the environments of a mask (B,): empty their stacks and draw their cameras again."""
+        """Begin episodes of a mask (B,): empty their stacks and draw their cameras again."""
         self._fresh |= mask
         for sensor in self._sensors.values():
             if sensor.cameras is not None:
@@ -176,7 +176,7 @@ class _SensorTouch:
         return result
 
     def _tracked(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Displacements (B, M, 2) [m] with noise, 0 of markers that are lost, and 1 (B, M) of those that are not."""
+        """Displacements (B, M, 2) [m] with noise, 0 where lost, and 1 (B, M) where not lost."""
         moved, drawn = self._markers, self._perturbation
         visible = torch.ones(moved.shape[:2], dtype=torch.int8, device=moved.device)
         if drawn.noise_px:
@@ -222,7 +222,7 @@ class _SensorTouch:
 
 
 def _without_perturbation(markers: MarkersConfig | None) -> tuple[MarkersConfig | None, MarkerPerturbation]:
-    """Model of markers on the device, and its perturbation. Raises ``InputError`` for a pattern that moves."""
+    """Model of markers, and its perturbation; InputError for a pattern that moves."""
     drawn = None if markers is None else markers.perturbation
     if markers is None or drawn is None:
         return markers, MarkerPerturbation()
