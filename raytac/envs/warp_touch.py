@@ -91,32 +91,37 @@ class WarpTouch:
         for pad in self.pads.values():
             pad.check()
 
-    def observe(self) -> dict[str, torch.Tensor]:
-        """Observations (B, …) after ``launch``: ``<sensor>_<modality>``; with a stack once a step."""
+    def observe(self, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+        """Observations (B, …) after ``launch``: ``<sensor>_<modality>``.
+
+        ``mask`` (B,): environments that are observed, None for all; the others keep their last observation, and their stacks do not move.
+        """
         result = {}
         for k, (name, settings) in enumerate(self._settings.items()):
             values = {"wrench": self._wrenches[:, k]}
             if name in self._sensors:
                 values |= self._sensors[name].observe()
             for modality in settings.modalities:
-                value, scale = values[modality], self._scales.get((name, modality))
-                value = value if scale is None else (value / scale).float()
-                result[f"{name}_{modality}"] = self._stacked(f"{name}_{modality}", value, settings.stack)
-        self._fresh = torch.zeros_like(self._fresh)
+                key, scale = f"{name}_{modality}", self._scales.get((name, modality))
+                value = values[modality] if scale is None else (values[modality] / scale).float()
+                if settings.stack > 1:
+                    value = self._stacked(key, value, settings.stack)
+                if mask is not None and key in self._last:
+                    value = torch.where(_rows(mask, value), value, self._last[key])
+                self._last[key] = value
+                result[key] = value.clone()  # a learner may write to it
+        self._fresh = torch.zeros_like(self._fresh) if mask is None else self._fresh & ~mask
         return result
 
     def _stacked(self, key: str, now: torch.Tensor, count: int) -> torch.Tensor:
         """The last ``count`` observations as ``TactileObserver`` stacks them; all the present one where an episode has begun."""
-        if count == 1:
-            return now
         is_image = key.endswith("_rgb")
         first = now.repeat(1, 1, 1, count) if is_image else now[:, None].repeat(1, count, *(1 for _ in now.shape[1:]))
-        if key in self._last:
-            last = self._last[key]
-            moved = torch.cat([last[..., 3:], now], dim=-1) if is_image else torch.cat([last[:, 1:], now[:, None]], dim=1)
-            first = torch.where(self._fresh.reshape(-1, *(1 for _ in first.shape[1:])), first, moved)
-        self._last[key] = first
-        return first
+        if key not in self._last:
+            return first
+        last = self._last[key]
+        moved = torch.cat([last[..., 3:], now], dim=-1) if is_image else torch.cat([last[:, 1:], now[:, None]], dim=1)
+        return torch.where(_rows(self._fresh, first), first, moved)
 
 
 class _SensorTouch:
@@ -228,3 +233,8 @@ def _without_perturbation(markers: MarkersConfig | None) -> tuple[MarkersConfig 
         rule = "must not shift or turn the pattern on the device"
         raise InputError("perturbation", value=drawn, rule=rule, choices=("noise_px", "dropout"))
     return replace(markers, perturbation=None), drawn
+
+
+def _rows(mask: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    """A mask (B,) in the shape that chooses rows of values (B, …)."""
+    return mask.reshape(-1, *(1 for _ in values.shape[1:]))
