@@ -15,6 +15,7 @@ import warp as wp
 from raytac.envs.warp_cameras import WarpCameras
 from raytac.errors import InputError
 from raytac.gel.surface import make_grid
+from raytac.gel.traction import cell_areas, spread_force
 from raytac.markers import MarkerPerturbation
 from raytac.markers.base import MarkersConfig
 from raytac.markers.ink_kernels import DeviceInk
@@ -100,7 +101,7 @@ class WarpTouch:
         for k, (name, settings) in enumerate(self._settings.items()):
             values = {"wrench": self._wrenches[:, k]}
             if name in self._sensors:
-                values |= self._sensors[name].observe()
+                values |= self._sensors[name].observe(values["wrench"])
             for modality in settings.modalities:
                 key, scale = f"{name}_{modality}", self._scales.get((name, modality))
                 value = values[modality] if scale is None else (values[modality] / scale).float()
@@ -159,12 +160,16 @@ class _SensorTouch:
             if self._images is not None:
                 self._ink = DeviceInk(grid, spec.markers.radius, num_envs=count, device=str(device))
         self._at_rest: torch.Tensor | None = None
-        if {"height", "indentation", "contact"} & set(settings.modalities):
+        if {"height", "indentation", "contact", "traction"} & set(settings.modalities):
             matrices = CellMeans(grid.shape, settings.map_shape).matrices()
             self._rows, self._columns = (torch.tensor(one, dtype=torch.float32, device=generator.device) for one in matrices)
+            x, y, area = (
+                torch.tensor(one, dtype=torch.float32, device=generator.device) for one in (grid.x, grid.y, cell_areas(grid))
+            )
+            self._nodes = x, y, area
 
-    def observe(self) -> dict[str, torch.Tensor]:
-        """All modalities but the wrench, in SI units."""
+    def observe(self, wrench: torch.Tensor) -> dict[str, torch.Tensor]:
+        """All modalities but the ``wrench`` (B, 6), in SI units."""
         result, wanted = {}, self._settings.modalities
         if self._settings.needs_markers:
             result["markers"], result["marker_visible"] = self._tracked()
@@ -174,6 +179,10 @@ class _SensorTouch:
             result["indentation"] = self._means(self._rest - self._height)
         if "contact" in wanted:
             result["contact"] = self._means(self._contact.float())
+        if "traction" in wanted:
+            force, indentation = wrench.float(), self._rest - self._height
+            spread = spread_force(self._nodes, self._contact != 0, indentation, force, force[:, 5], about_origin=True)
+            result["traction"] = self._means(spread.movedim(-1, 1)).movedim(1, -1)
         if "rgb" in wanted:
             result["rgb"] = self._image()
         return result

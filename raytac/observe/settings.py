@@ -17,7 +17,7 @@ from raytac.optics.registry import chosen_optics
 from raytac.sensor.options import LARGEST_SIDE, checked_resolution
 from raytac.specs.sensor import SensorSpec
 
-MODALITIES = ("rgb", "markers", "marker_visible", "height", "indentation", "contact", "wrench")
+MODALITIES = ("rgb", "markers", "marker_visible", "height", "indentation", "contact", "traction", "wrench")
 """Names that ``modalities`` accepts:
 
 - ``rgb``: the camera's image, uint8, (H, W, 3);
@@ -26,15 +26,17 @@ MODALITIES = ("rgb", "markers", "marker_visible", "height", "indentation", "cont
 - ``height``: height of the surface over the pad frame's origin, (rows, columns);
 - ``indentation``: height at rest minus height, (rows, columns); negative where the gel bulges;
 - ``contact``: share of a cell that is in contact, (rows, columns), 0 to 1;
+- ``traction``: force on the pad per area of a cell, pad frame, (rows, columns, 3);
 - ``wrench``: force on the pad and torque about the pad frame's origin, pad frame, (6,).
 """
 SCALES: Mapping[str, float | tuple[float, ...]] = {
     "markers": 1e-3,
     "height": 1e-3,
     "indentation": 1e-3,
+    "traction": 1e4,
     "wrench": (10.0, 10.0, 10.0, 0.1, 0.1, 0.1),
 }
-"""Divisors that bring values to the order of 1: lengths [m], force [N] and torque [N m]."""
+"""Divisors that bring values to the order of 1: lengths [m], traction [Pa], force [N] and torque [N m]."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class ObservationSettings:
     difference: bool = False
     """``rgb`` becomes (255 + image − image at rest) // 2, which is 127 where nothing has changed and cannot overflow."""
     map_shape: tuple[int, int] = (32, 32)
-    """(rows, columns) of ``height``, ``indentation`` and ``contact``: means over equal cells of the pad, no more than
+    """(rows, columns) of ``height``, ``indentation``, ``contact`` and ``traction``: means over equal cells of the pad, no more than
     its grid has nodes."""
     stack: int = 1
     """Number of last observations: images are stacked in the channels, all else along a new first axis, oldest first. After a reset all
@@ -117,7 +119,7 @@ class ObservationSettings:
     @property
     def outputs(self) -> tuple[str, ...]:
         """Outputs of a ``TactileSensor`` that are needed; the surface, from which maps are made, is always there."""
-        return tuple(name for name in ("rgb", "wrench") if name in self.modalities)
+        return tuple(name for name in ("rgb", "traction", "wrench") if name in self.modalities)
 
 
 @dataclass(frozen=True)
