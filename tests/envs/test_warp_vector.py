@@ -23,7 +23,7 @@ from raytac.observe import ObservationSettings
 
 SEEN = ObservationSettings(("markers", "wrench"), stack=2)
 OPTIONS: dict[str, Any] = {"tactile": SEEN, "max_episode_steps": 6, "device": "cpu", "seed": 0}
-DOWN = torch.tensor([[0.0, 0.0, -1.0], [0.3, 0.0, -1.0], [0.0, 0.2, -0.5]])
+DOWN = torch.tensor([[0.0, 0.0, -1.0], [0.3, 0.0, -0.5], [0.0, 0.2, -1.0]])
 
 
 def equal(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], rows: list[int]) -> bool:
@@ -52,26 +52,28 @@ def test_every_task_is_a_gymnasium_vector_of_tensors() -> None:
 
 def test_an_episode_that_ends_shows_its_last_observation_in_every_mode() -> None:
     """Of the third environment alone, whose episode was set to end first; the others are the same to the bit."""
-    envs = {mode: WarpVectorEnv("PushCube", 3, autoreset_mode=mode, **OPTIONS) for mode in ("SameStep", "NextStep", "Disabled")}
+    options, last_step = {**OPTIONS, "max_episode_steps": 12}, 8
+    envs = {mode: WarpVectorEnv("PushCube", 3, autoreset_mode=mode, **options) for mode in ("SameStep", "NextStep", "Disabled")}
     for env in envs.values():
         env.reset(seed=4)
-        env.batch.steps[2] = 3
+        env.batch.steps[2] = 3  # of twelve
     last: dict[str, Any] = {}
-    for step in range(4):
+    for step in range(last_step + 2):
         found = {mode: env.step(DOWN) for mode, env in envs.items()}
-        ended = [step == 2 and b == 2 for b in range(3)]
+        ended = [step == last_step and b == 2 for b in range(3)]
         assert found["SameStep"][3].tolist() == found["NextStep"][3].tolist() == ended
-        assert found["Disabled"][3].tolist() == [step >= 2 and b == 2 for b in range(3)]
+        assert found["Disabled"][3].tolist() == [step >= last_step and b == 2 for b in range(3)]
         first = found["SameStep"]
         for mode in ("NextStep", "Disabled"):
-            assert equal(found[mode][0], first[4]["final_obs"], [0, 1, 2] if step < 3 else [0, 1]), (mode, step)
+            assert equal(found[mode][0], first[4]["final_obs"], [0, 1, 2] if step <= last_step else [0, 1]), (mode, step)
             torch.testing.assert_close(found[mode][1][:2], first[1][:2], rtol=0, atol=0)
         assert first[4]["_final_obs"].tolist() == ended
         assert equal(first[0], first[4]["final_obs"], [0, 1])
-        if step == 2:
+        if step == last_step:
             last = first[4]["final_obs"]
             begun = first[0]["state"][2]
             assert not torch.equal(begun, last["state"][2]) and not begun[-3:].any() and last["state"][2, -1] != 0.0
+            assert last["sensor_markers"][2].abs().max() > 0.01  # the pad is pressed
     # In the step after the end an episode begins in place of one: reward 0, the first observation, twice in the stack.
     seen, reward, terminated, truncated, _ = found["NextStep"]
     assert reward[2] == 0.0 and not (terminated[2] or truncated[2]) and envs["NextStep"].batch.steps[2] == 0
@@ -79,7 +81,7 @@ def test_an_episode_that_ends_shows_its_last_observation_in_every_mode() -> None
     env = envs["Disabled"]
     kept = found["Disabled"][0]
     seen, _ = env.reset(options={"reset_mask": np.array([False, False, True])})
-    assert equal(seen, kept, [0, 1]) and not seen["state"][2, -3:].any() and env.batch.steps.tolist() == [4, 4, 0]
+    assert equal(seen, kept, [0, 1]) and not seen["state"][2, -3:].any() and env.batch.steps.tolist() == [10, 10, 0]
     assert not env.step(DOWN)[3].any()
 
 
