@@ -1,4 +1,4 @@
-"""``TaskBatch``: B environments of one task without Gymnasium, from actions to observations, rewards and ends."""
+"""``TaskBatch``: B environments of one task without Gymnasium, from actions to rewards."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from raytac.checks import check_known, check_numbers, check_whole
+from raytac.device import resolve_device
 from raytac.envs.action_control import ACTIONS, ActionControl
 from raytac.envs.task_observation import observation_arrays
 from raytac.envs.task_progress import TaskProgress
@@ -20,6 +21,7 @@ from raytac.envs.variations import VariationRanges, VariationSampler, on_mounted
 from raytac.errors import InputError
 from raytac.gel.surface import rounded_envs
 from raytac.observe import ObservationSettings, Randomization
+from raytac.optics.base import OPTICAL_OUTPUTS
 from raytac.physics.base import PhysicsConfig
 from raytac.physics.registry import checked_physics
 from raytac.robots.pose_errors import PoseErrors
@@ -40,7 +42,7 @@ class StepResult:
     """Terms of the reward by name."""
     success: np.ndarray
     failed: np.ndarray
-    """Environments whose physics broke down: truncated, with reward 0 and their last sound observation."""
+    """Environments whose physics broke down: truncated, reward 0, last sound observation."""
 
 
 class TaskBatch:
@@ -99,6 +101,10 @@ class TaskBatch:
             options = sensors.probe.sensor_options()
         options["pitch"] = sensors.pitch if pitch is None else pitch
         self.world = TactileWorld(sensors.scene, physics=sensors.physics, device=device, **options)
+        if set(options["outputs"]) & set(OPTICAL_OUTPUTS) and resolve_device(device) == "cpu":
+            from raytac.optics.runtime import share_cores
+
+            share_cores()
         names, rigid = self.world.sensor_names, not sensors.physics.is_simulated
         ranges = VariationRanges(sensors.scene, names, sensors.randomization, rigid=rigid)
         self._variations = VariationSampler(ranges, num_envs=num_envs, seed=seed)
@@ -166,7 +172,7 @@ class TaskBatch:
     # --- episodes --------------------------------------------------------------------------------------------------------------
 
     def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
-        """Seed the random streams of cameras, markers, bodies and mounts; the next ``reset`` draws from them."""
+        """Seed the streams of cameras, markers, bodies and mounts for the next ``reset``."""
         self._variations.reseed(envs, seeds)
         for i, (name, observer) in enumerate(self.observers.items()):
             sensor_seeds = [sensor_seed(seed, i) for seed in seeds]
@@ -175,7 +181,7 @@ class TaskBatch:
                 self.world.sensors[name].marker_tracker.reseed(envs, sensor_seeds)
 
     def reset(self, envs: Sequence[int], rngs: Sequence[np.random.Generator]) -> dict[str, np.ndarray]:
-        """Begin episodes in environments, each with its own generator; returns the observation (B, …) of all environments."""
+        """Begin episodes in ``envs``, each with its generator; returns all observations (B, …)."""
         envs = list(envs)
         u = np.array([rng.random(self.task.draws) for _, rng in zip(envs, rngs, strict=True)]).reshape(len(envs), self.task.draws)
         starts = self.task.starts(u, self.start_tool, self.start_body)
@@ -229,9 +235,9 @@ class TaskBatch:
     # --- observations ----------------------------------------------------------------------------------------------------------
 
     def _observe(self, which: np.ndarray, state: WorldState) -> dict[str, np.ndarray]:
-        """Observations of all environments; sensors are read in those of ``which`` (B,), the others keep their last reading.
+        """Observations of all environments; sensors are read in those of ``which`` (B,).
 
-        ``state``: present state of the world.
+        The others keep their last reading. ``state``: present state of the world.
         """
         result = self._progress.observation(self._opening)
         if self.body_seen:

@@ -1,4 +1,4 @@
-"""Vectors of environments in processes of their own, each with a world: physics of a world runs on one core."""
+"""Vectors of environments in processes, each with a world on one core."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ def one_thread() -> Iterator[None]:
 
 
 class Workers:
-    """Processes that each make one vector and reply to commands. Ctrl-C reaches the caller alone, and workers end with it.
+    """Processes that each make one vector and reply to commands.
+
+    Ctrl-C reaches the caller alone, and workers end with it.
 
     Attributes:
         each: number of environments of a process.
@@ -80,7 +82,7 @@ class Workers:
             pipe.send((command, value))
 
     def replies(self) -> list[Any]:
-        """One reply of every process. All are read before an error is raised, so that none is mistaken for a later one."""
+        """One reply of every process, all read before an error is raised, so none is left over."""
         replies = []
         for k, (worker, pipe) in enumerate(self._workers):
             try:

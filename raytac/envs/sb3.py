@@ -1,4 +1,4 @@
-"""Environments for stable-baselines3: a vector of ours as its ``VecEnv``, and several of them in processes."""
+"""Environments for stable-baselines3: our vectors as its ``VecEnv``, also in processes."""
 
 # pyright: reportMissingImports=false
 # (stable-baselines3 and PyTorch belong to the extra "rl", which the tests do without.)
@@ -58,7 +58,7 @@ class TactileVecEnv(_DictVecEnv):
     """
 
     def __init__(self, env: TactileVectorEnv | WarpVectorEnv) -> None:
-        """Wrap ``env``. Raises ``InputError`` for a vector that does not reset environments in the step in which they end."""
+        """Wrap ``env``; InputError unless it resets environments in the step that ends them."""
         mode = env.metadata["autoreset_mode"]
         if mode is not AutoresetMode.SAME_STEP:
             raise InputError("autoreset_mode", value=mode.value, rule="must be 'SameStep' for stable-baselines3")
@@ -79,7 +79,7 @@ class TactileVecEnv(_DictVecEnv):
         self._actions = actions
 
     def step_wait(self) -> Step:
-        """Step with the actions kept. Raises ``InputError``, naming the environment, for one that is not finite or out of bounds."""
+        """Step with the actions kept; InputError names an environment not finite or out of bounds."""
         return _vec_env_step(*(_on_host(one) for one in self.env.step(self._actions)))
 
 
@@ -115,7 +115,7 @@ class ProcessVecEnv(_DictVecEnv):
         return _joined([observation for observation, _ in self._workers.replies()])
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Start the step in all processes. Raises ``InputError``, naming the environment, for actions that are not finite."""
+        """Start the step in all processes; InputError names an environment not finite."""
         actions = np.asarray(actions)
         if not np.isfinite(actions).all():
             env = int(np.argwhere(~np.isfinite(actions))[0, 0])
@@ -123,7 +123,7 @@ class ProcessVecEnv(_DictVecEnv):
         self._workers.send("step", np.split(actions, len(self._workers)))
 
     def step_wait(self) -> Step:
-        """Wait for the step. Raises as ``TactileVecEnv.step_wait``; the message names the process and its environments."""
+        """Wait for the step; as ``TactileVecEnv.step_wait``, naming the process of an error."""
         steps = [_vec_env_step(*reply) for reply in self._workers.replies()]
         observations, rewards, dones, infos = zip(*steps, strict=True)
         return _joined(observations), np.concatenate(rewards), np.concatenate(dones), [info for part in infos for info in part]

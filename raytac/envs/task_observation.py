@@ -1,4 +1,4 @@
-"""Observations that every task has, of B environments; arrays of NumPy, or of PyTorch on any device."""
+"""Observations that every task has, of B environments; NumPy, or PyTorch on a device."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def state_and_goal(
 
 
 def body_from_tool(tool: Array, body: Array, speed: Array) -> Array:
-    """``body`` (B, 15), float32: position from the tool, first two columns of the rotation, velocity and angular velocity (B, 6)."""
+    """``body`` (B, 15): position from the tool, two columns of the rotation, velocities."""
     xp = array_namespace(tool)
     place = (body[:, :3, 3] - tool[:, :3, 3]) / _LENGTH
     return xp.astype(xp.concat([place, body[:, :3, 0], body[:, :3, 1], speed / _SPEED], axis=1), xp.float32)

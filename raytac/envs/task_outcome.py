@@ -1,4 +1,4 @@
-"""Reward and ends of a step, of B environments; arrays of NumPy, or of PyTorch on any device."""
+"""Reward and ends of a step, of B environments; NumPy, or PyTorch on any device."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``WarpBatch``: B environments of one task on MuJoCo Warp, from actions to observations, rewards and ends, all on one device."""
+"""``WarpBatch``: B environments of one task on MuJoCo Warp, all on one device."""
 
 # pyright: reportMissingImports=false
 # (PyTorch belongs to the extra "rl", which the tests do without.)
@@ -177,7 +177,7 @@ class WarpBatch:
 
     @property
     def wrench(self) -> dict[str, torch.Tensor]:
-        """Wrench (B, 6) on every sensor in the last step, pad frame [N, N m]; it is overwritten by the next."""
+        """Wrench (B, 6) on every sensor in the last step, pad frame [N, N m], until the next."""
         return {name: self._wrenches[:, k] for k, name in enumerate(self._names)}
 
     def reset(self, seed: int | None = None, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
@@ -201,7 +201,7 @@ class WarpBatch:
             return self._observe(mask)
 
     def step(self, actions: torch.Tensor, begin: torch.Tensor | None = None, *, final: bool = False) -> WarpStep:
-        """One control step of every environment; ``actions`` (B, size) are cut to [−1, 1], and NaN is 0.
+        """One control step; ``actions`` (B, size) are cut to [−1, 1], and NaN is 0.
 
         Args:
             actions: of all environments.

@@ -1,4 +1,4 @@
-"""``WarpTouch``: observations that the sensors of a ``WarpWorld`` make, as tensors on its device."""
+"""``WarpTouch``: sensors' observations of a ``WarpWorld``, as tensors on its device."""
 
 # pyright: reportMissingImports=false
 # (PyTorch belongs to the extra "rl", which the tests do without.)
@@ -27,7 +27,9 @@ from raytac.world.warp_world import WarpWorld
 
 
 class WarpTouch:
-    """Observations of all sensors of B environments, named and scaled as those of ``TactileObserver``.
+    """Observations of all sensors of B environments, as of ``TactileObserver``.
+
+    Names and scales are the same.
 
     Attributes:
         pads: surfaces and markers of every sensor by its name; empty where the wrench alone is observed.

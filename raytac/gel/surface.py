@@ -17,7 +17,7 @@ from raytac.specs.sensor import GelpadSpec
 
 
 def summary(record: Any, names: Sequence[str] | None = None) -> str:
-    """A dataclass on one line: arrays by type and shape, without empty fields; ``names``: fields that are shown, None for all."""
+    """One line on a dataclass: its fields ``names`` (None: all) but empty ones, arrays by shape."""
     shown = []
     for name in [f.name for f in fields(record)] if names is None else names:
         value = getattr(record, name)

@@ -1,4 +1,4 @@
-"""Dots on the coat: their positions at rest, which the camera must see, and the ink that they print on the surface."""
+"""Dots on the coat: positions at rest, which the camera must see, and printed ink."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from raytac.specs.sensor import MarkerSpec, SensorSpec
 
 
 def marker_centres(spec: MarkerSpec) -> np.ndarray:
-    """x, y of the dots at rest [m], pad frame, shape (M, 2), row by row: dot (j, i) of ``rows`` and ``columns`` is j · columns + i."""
+    """x, y of the dots at rest [m], pad frame, (M, 2); dot (j, i) is j · columns + i."""
     x = spec.offset[0] + (np.arange(spec.columns) - 0.5 * (spec.columns - 1)) * spec.pitch[0]
     y = spec.offset[1] + (np.arange(spec.rows) - 0.5 * (spec.rows - 1)) * spec.pitch[1]
     return np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1).reshape(-1, 2)
 
 
 def camera_of(sensor: SensorSpec, resolution: tuple[int, int] | None = None) -> Pinhole:
-    """The camera that makes the sensor's images, at ``resolution`` (width, height) [px]; None is the sensor's own."""
+    """Camera of the sensor at ``resolution`` (width, height) [px]; None is the sensor's own."""
     if sensor.refraction.model == "none":
         return Pinhole.from_spec(sensor.camera, resolution)
     from raytac.optics.refraction import Slab
@@ -49,7 +49,11 @@ class MarkerPattern:
         shift: np.ndarray | None = None,
         turn: np.ndarray | None = None,
     ) -> MarkerPattern:
-        """Place the sensor's dots, turned by ``turn`` (B,) [rad] about the pad's centre, then moved by ``shift`` (B, 2) [m].
+        """Place the sensor's dots, turned about the pad's centre, then shifted.
+
+        Args:
+            shift: (B, 2) [m].
+            turn: (B,) [rad].
 
         Raises:
             InputError: the sensor has no markers, or a shift takes one off the pad or out of the view.
@@ -90,7 +94,7 @@ class MarkerPattern:
         return self.rest.shape[1]
 
     def for_batch(self, batch: int) -> np.ndarray:
-        """``rest`` for ``batch`` environments, (B, M, 3); ``InputError`` if it was shifted for another number."""
+        """``rest`` of ``batch`` environments, (B, M, 3); InputError if shifted for another number."""
         if len(self.rest) not in (1, batch):
             raise InputError("batch", value=batch, rule=f"the pattern was placed for {len(self.rest)} environments")
         return np.broadcast_to(self.rest, (batch, *self.rest.shape[1:]))

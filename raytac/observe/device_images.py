@@ -1,4 +1,4 @@
-"""Observed images of many pads that stay on the device, for a solver and a learner on the same device."""
+"""Observed images of many pads, for a solver and a learner on one device."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from raytac.sensor import TactileSensor
 
 
 class DeviceImages:
-    """The ``rgb`` of a ``TactileObserver``, from heights on the device to an image on the device.
+    """The ``rgb`` of a ``TactileObserver``, from heights on a device to images on it.
 
     .. code-block:: python
 

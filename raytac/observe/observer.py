@@ -106,9 +106,9 @@ class TactileObserver:
         return replace(config, perturbation=drawn)
 
     def sensor_options(self) -> dict[str, Any]:
-        """Keyword arguments of a ``TactileSensor`` with the outputs observed, without the sensor and the physics.
+        """Keyword arguments of a ``TactileSensor`` with the outputs observed.
 
-        Of images only the crop that is observed is rendered.
+        Sensor and physics are not among them. Of images only the observed crop is rendered.
         """
         settings, optics = self.settings, chosen_optics(self.settings.optics)
         if self.layout.crop is not None and not isinstance(optics, BuiltOptics):
@@ -123,7 +123,7 @@ class TactileObserver:
         }
 
     def make_sensor(self, **options: Any) -> TactileSensor:
-        """Make a sensor with the outputs observed; ``options`` of ``TactileSensor`` override those of the settings."""
+        """Make a sensor with the outputs observed; ``options`` override those of the settings."""
         return TactileSensor(self.sensor, **{**self.sensor_options(), **options})
 
     def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
@@ -132,7 +132,10 @@ class TactileObserver:
             self._drift.reseed(envs, seeds)
 
     def reset(self, envs: np.ndarray | Sequence[int] | None = None) -> None:
-        """Begin episodes in environments (a mask (B,), a list, or None for all): empty the stacks and draw the cameras again.
+        """Begin episodes: empty the stacks and draw the cameras again.
+
+        Args:
+            envs: mask (B,) or list of environments; None for all.
 
         Raises:
             InputError: an environment that does not exist.
@@ -167,7 +170,7 @@ class TactileObserver:
         return self._finished(values, frame.failed, rows)
 
     def observe_wrench(self, wrench: np.ndarray, failed: np.ndarray, envs: np.ndarray) -> dict[str, np.ndarray]:
-        """As ``observe``, from wrenches of the world, where only the ``wrench`` is observed and no surface is needed.
+        """Observe the ``wrench`` alone, from wrenches of the world; no surface is needed.
 
         Args:
             wrench: wrenches of all environments (B, 6).
@@ -233,7 +236,7 @@ class TactileObserver:
         return ((255 + images.astype(np.int16) - self._rest[rows]) // 2).astype(np.uint8)
 
     def _take_rest(self, sensor: TactileSensor | None, rows: np.ndarray) -> None:
-        """Render the pads of ``rows`` at rest with their present cameras, if they were reset since the last time."""
+        """Render pads at rest with their present cameras, where ``rows`` were reset."""
         stale = np.unique(rows[self._stale_rest[rows]])
         if not len(stale):
             return
@@ -308,7 +311,7 @@ class TactileObserver:
 
 
 class CellMeans:
-    """Means over (rows, columns) cells of values at nodes (B, Ny, Nx, …); a node belongs to the cell that contains it."""
+    """Means over (rows, columns) cells of values at nodes (B, Ny, Nx, …), each in one cell."""
 
     def __init__(self, nodes: tuple[int, int], cells: tuple[int, int]) -> None:
         """Raises ``InputError`` if there are more cells than nodes."""

@@ -1,4 +1,4 @@
-"""Seeded differences between nominally equal sensors, drawn for each environment or once for a world."""
+"""Seeded differences between nominally equal sensors, for each environment or for a world."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from raytac.specs.sensor import SensorSpec
 from raytac.specs.task import TaskScene
 
 _ABSOLUTE = {"noise": np.inf, "pad_shift": 0.02, "pad_turn": 0.5}
-"""Widths that are not relative to 1, and their upper bounds: a larger one is no mounting error."""
+"""Upper bounds of widths that are not relative to 1: a larger one is no mounting error."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,11 @@ class Randomization:
     body_mass: float = 0.0
     """Mass of each free body."""
     body_friction: float = 0.0
-    """Friction coefficient of each body that has one in the scene, against gel and all else alike. For two bodies in contact MuJoCo uses
-    the greater coefficient."""
+    """Friction coefficient of each body that has one in the scene, against all it touches.
+
+    For two bodies in contact MuJoCo uses the greater coefficient."""
     pad_shift: float = 0.0
-    """Shift of each pad on its mount, along each axis of the pad frame [m]; the arm's control ignores it."""
+    """Shift of each pad on its mount along each pad axis [m]; the arm's control ignores it."""
     pad_turn: float = 0.0
     """Rotation of each pad on its mount: each component of a rotation vector, pad frame [rad]."""
     exposure: float = 0.0
@@ -102,7 +103,7 @@ class Randomization:
 
 
 def randomised_sensor(sensor: SensorSpec, randomization: Randomization, seed: int) -> SensorSpec:
-    """Sensor drawn by a seed; the same sensor if nothing of it varies. A reflectance is at most 1."""
+    """Sensor drawn by a seed, the same if nothing of it varies; reflectances are at most 1."""
     r = randomization
     if not r.changes_sensor:
         return sensor
@@ -121,7 +122,7 @@ def randomised_sensor(sensor: SensorSpec, randomization: Randomization, seed: in
 
 
 def randomised_bodies(scene: TaskScene, randomization: Randomization, seed: int) -> TaskScene:
-    """Scene with bodies drawn by a seed, equal in all environments; the same scene if none varies."""
+    """Scene with bodies drawn by a seed, equal in all environments; the same if none varies."""
     r = randomization
     if not r.changes_bodies:
         return scene

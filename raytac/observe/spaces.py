@@ -1,4 +1,4 @@
-"""Observations for learners: shapes, types and bounds, spaces of Gymnasium, tensors of PyTorch."""
+"""Spaces of Gymnasium and tensors of PyTorch for observations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gymnasium wrappers that add observations of tactile sensors to an environment, or to a vector of them."""
+"""Gymnasium wrappers that add tactile observations to an environment or a vector of them."""
 
 from __future__ import annotations
 
@@ -19,12 +19,15 @@ except ModuleNotFoundError as error:
     raise BackendError("Gymnasium is not installed: pip install 'raytac[rl]'") from error
 
 Frames = Callable[..., Mapping[str, TactileFrame]]
-"""Function that returns the present frame of each sensor, as ``TactileWorld.observe``. Where some environments of a vector are reset it
-is called with ``envs=``, a list of them, and returns frames of these alone."""
+"""Function that returns the present frame of each sensor, as ``TactileWorld.observe``.
+
+Where some environments of a vector are reset, it is called with ``envs=``, a list of them, and returns frames of these alone."""
 
 
 class AddTactile(gymnasium.Wrapper):
-    """Dict of the environment's observation (its keys if it is a Dict, else ``observation``) and the modalities of each sensor.
+    """Dict of the environment's observation and the modalities of each sensor.
+
+    The environment's observation keeps its keys if it is a Dict; else it is ``observation``.
 
     .. code-block:: python
 

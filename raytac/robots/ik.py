@@ -263,7 +263,7 @@ class PoseServo:
         return self._latest.targets(world_from_target, twist, duration)
 
     def struct(self, arrays: Mapping[str, wp.array]) -> Any:
-        """Arguments of the kernel ``servo_step`` for B states, on the device of ``arrays``: the numbers ``SERVO_READS`` of the arm."""
+        """Arguments of ``servo_step`` from ``arrays``, ``SERVO_READS`` of B states on a device."""
         joints, n = arrays["joints"], len(self.arm)
         servo: Any = Servo()
         servo.joints, servo.anchor, servo.axis, servo.site = (arrays[name] for name in SERVO_READS)

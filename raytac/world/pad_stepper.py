@@ -95,7 +95,7 @@ class PadStepper:
         self._frames.reset(chosen)
 
     def step(self, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData]) -> None:
-        """One step of MuJoCo with the pads' contact, of one state or of B; the controls are in ``data.ctrl``.
+        """One step of MuJoCo with the pads' contact, of one state or B; ``data.ctrl`` is set.
 
         Raises:
             InputError: another model, timestep or number of states, or a control that is not finite.
@@ -136,7 +136,7 @@ class PadStepper:
         self._time[:] = [one.time for one in datas]
 
     def wrench(self, name: str) -> np.ndarray:
-        """Wrench (B, 6) on a pad about its origin in the last step, pad frame; NaN of a failed state.
+        """Wrench (B, 6) on a pad about its origin in the last step, pad frame; NaN if failed.
 
         Raises ``InputError`` for an unknown sensor.
         """

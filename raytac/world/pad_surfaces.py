@@ -1,4 +1,4 @@
-"""Surfaces of rigid pads among bodies: the underside of what is near, and the elastic surround."""
+"""Surfaces of rigid pads among bodies: undersides and the elastic surround."""
 
 from __future__ import annotations
 

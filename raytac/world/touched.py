@@ -15,7 +15,7 @@ from raytac.robots.mount import MountedSensor
 from raytac.shapes.part import Part, mesh_part
 
 TouchChoice = Sequence[str] | Mapping[str, float | None]
-"""Names of bodies or geoms that pads touch; a mapping has their friction coefficients against gel, None for the gel's own."""
+"""Names of bodies or geoms that pads touch; a mapping has friction, None the gel's own."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ _NAN = wp.constant(wp.float64(float("nan")))
 
 @wp.kernel
 def choose_active(active: wp.array(dtype=wp.bool), steps: Steps):
-    """Row i of the next step is environment i where that is ``active``, and no environment elsewhere; none has done a tick."""
+    """Let row i of the next step be environment i where ``active``, else none, at tick 0."""
     i = wp.tid()
     steps.envs[i] = wp.where(active[i], i, -1)
     steps.done[i] = 0

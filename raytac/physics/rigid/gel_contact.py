@@ -1,4 +1,4 @@
-"""Contact of all gels of a world in one step: the kernels from the bodies' motion to the rows, and from forces to the shear."""
+"""Contact of a world's gels in one step: kernels from motion to rows, and force to shear."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ from raytac.specs.sensor import GelpadSpec
 from raytac.warp_runtime import start_warp
 
 _AHEAD = 0.05
-"""Share of the gel's thickness by which a step may go deeper on a load law that is tabulated: twice what fast bodies may (``longest``)."""
+"""Share of the gel's thickness that a step may go deeper: twice what fast bodies may.
+
+The load law is tabulated so far (``longest``)."""
 _SHORTEST = 1e-6
 """Steps are not shorter than this, or half of it [s]."""
 
@@ -135,10 +137,7 @@ class GelContact:
             search.reserve(search.pairs)
 
     def begin(self, *, whole: bool = False) -> None:
-        """Find contacts from ``frames``, choose the length of each environment's step, and set the rows of its contacts.
-
-        ``whole``: of the scene's step, which is not divided.
-        """
+        """Find contacts from ``frames``, choose steps (unless ``whole``), and set the rows."""
         self._move_bodies()
         for search, pad, body in self._pairs:
             poses = [self.motion, self.steps, pad, body, *self._clock, search.poses, search.reach]
@@ -180,7 +179,7 @@ class GelContact:
         self._launch(sum_wrenches, self.wrenches.shape[1:], [self.slots, self.steps, self._touched, self.wrenches])
 
     def choose(self, envs: np.ndarray, done: np.ndarray | int) -> None:
-        """Name the n environments of the next step, whose rows are the first n; ``done`` (n,): ticks of the scene's step behind them."""
+        """Name the n environments of the next step; ``done`` (n,): ticks of the scene's step done."""
         count, self.chosen = len(envs), envs.tolist()
         self._envs[:count], self._envs[count:] = envs, -1
         self._done[:count] = done
@@ -189,7 +188,7 @@ class GelContact:
             self.steps.done.assign(self._done)
 
     def choose_active(self, active: wp.array) -> None:
-        """Make row i of the next step environment i where that is ``active`` (B,), bool, on the device."""
+        """Make row i of the next step environment i where ``active`` (B,), bool, on the device."""
         self._launch(choose_active, (), [active, self.steps])
 
     def clear(self, envs: Sequence[int] | np.ndarray) -> None:
@@ -281,7 +280,7 @@ def _touched(bodies: Bodies, device: Any) -> Any:
 
 
 def _box(part: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Axes, centre and half edges of a box that holds a part, body frame; of a half-space its frame, and inf."""
+    """Axes, centre, half edges of a part's box, body frame; of a half-space its frame and inf."""
     turn, at = part.object_from_part[:3, :3], part.object_from_part[:3, 3]
     if part.kind == "plane":
         return turn, at, np.full(3, np.inf)

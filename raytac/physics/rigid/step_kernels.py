@@ -1,4 +1,4 @@
-"""Length of an environment's steps, in Warp: the scene's, halved until nothing moves too far in one near a pad.
+"""Length of an environment's steps: halved until nothing near a pad moves too far.
 
 Steps are Δt = T / 2^k of the scene's step T. One of 2^k ticks starts at a multiple of itself only, so that all end together at T.
 """
@@ -13,7 +13,7 @@ from __future__ import annotations
 import warp as wp
 
 from raytac.physics.rigid.contact_rows import Rows
-from raytac.physics.rigid.table_kernels import Law, force_at
+from raytac.physics.rigid.table_kernels import Law, force_at, radius_at
 from raytac.physics.rigid.world_kernels import (
     Differences,
     Gels,
@@ -28,8 +28,8 @@ from raytac.physics.rigid.world_kernels import (
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
-_TRAVEL = wp.constant(wp.float64(0.025))
-"""Greatest share of the gel's thickness by which a contact closes or opens in a step."""
+_TRAVEL = wp.constant(wp.float64(0.05))
+"""Greatest share of the gel's thickness by which any place of a contact closes or opens in a step."""
 _SWING = wp.constant(wp.float64(0.02))
 """Share of the thickness from which a contact that swings on its own stiffness is resolved …"""
 _PHASE = wp.constant(wp.float64(0.1))
@@ -55,19 +55,20 @@ def law_of(
 
 @wp.func
 def longest_step(
-    depth: wp.float64, speed: wp.float64, rate: wp.float64, acceleration: wp.float64, thickness: wp.float64
+    depth: wp.float64, speed: wp.float64, tilting: wp.float64, rate: wp.float64, acceleration: wp.float64, thickness: wp.float64
 ) -> wp.float64:
     """Longest step [s] of one contact.
 
     Args:
         depth: δ [m], negative is a gap.
         speed: at which it closes [m/s].
+        tilting: speed at which its rim closes on one side and opens on the other, as the body tilts [m/s].
         rate: angular frequency [1/s] of the bodies on the spring between them, as deep as it goes in the scene's step.
         acceleration: of closing in the last step [m/s²].
         thickness: of the gel [m].
     """
     quick = wp.max(wp.abs(speed), wp.float64(1e-12))
-    inside = _TRAVEL * thickness / quick
+    inside = _TRAVEL * thickness / (quick + tilting)
     if wp.length(wp.vec2d(speed, acceleration / rate)) / rate > _SWING * thickness:
         inside = wp.min(inside, _PHASE / rate)
     if depth > _0:
@@ -97,7 +98,7 @@ def approach(
     steps: Steps,
     slots: Slots,
 ):
-    """Slots of one search's results: the speed at which each closes, and the step that it allows.
+    """Slots of one search's results: the closing speed of each, and the step it allows.
 
     ``pads``, ``bodies``: of the search, which begin with ``first_pad``, ``first_body`` of the slots. What has no law has gone through the
     gel, as two gels that overlap by more than one of them: its environment is lost. Where the compliance is 0 neither body moves.
@@ -122,11 +123,13 @@ def approach(
     left = timestep * (_1 - wp.float64(steps.done[i]) / wp.float64(scene_ticks))
     depth = rows.depth[row]
     deeper = depth + wp.min(wp.max(speed, _0) * left, _TRAVEL * thickness)
-    stiffness = force_at(rows, law_of(rows, row, vary, gels, touched, env, pad, body), deeper)[1]
+    law = law_of(rows, row, vary, gels, touched, env, pad, body)
+    stiffness = force_at(rows, law, deeper)[1]
+    tilting = wp.length(wp.cross(spin, rows.normal[row])) * radius_at(rows, law, deeper)
     slots.row[i, pad, body] = row
     slots.speed[i, pad, body] = speed
     slots.longest[i, pad, body] = longest_step(
-        depth, speed, wp.sqrt(stiffness * compliance), acceleration[env, pad, body], thickness
+        depth, speed, tilting, wp.sqrt(stiffness * compliance), acceleration[env, pad, body], thickness
     )
 
 

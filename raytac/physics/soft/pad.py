@@ -56,7 +56,7 @@ class SoftPad(PressPad):
         """Mesh the pad, make the object's surface and put both into the solver.
 
         Args:
-            level: a name of ``PAD_LEVELS``, or a mesh of one's own.
+            level: a name of ``PAD_LEVELS``, or a mesh of the user's.
             correction, control: as in ``Ipc``.
             device: where the solver runs, ``cpu`` or ``cuda``.
             sensor, scene, settings: as of ``PressPad``.
