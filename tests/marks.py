@@ -50,6 +50,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "envs/test_rsl_warp.py",
         "envs/test_warp_batch.py",
         "envs/test_warp_variation.py",
+        "envs/test_warp_vector.py",
         "ipc",
         "markers/test_other_models.py",
         "physics/rigid/test_pad_search.py",

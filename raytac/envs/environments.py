@@ -23,7 +23,6 @@ _RENDER_MODES = ("rgb_array",)
 _GAIN = 4.0
 """Length of a drawn arrow over the marker's displacement."""
 _PAPER, _INK, _DOT = (250, 250, 250), (43, 108, 176), (120, 120, 120)
-_MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)
 
 
 class _Task:
@@ -157,11 +156,7 @@ class TactileVectorEnv(_Task, gymnasium.vector.VectorEnv):
         Raises:
             InputError: a value out of its choices.
         """
-        try:
-            self._mode = AutoresetMode(autoreset_mode)
-        except ValueError as error:
-            choices = [mode.value for mode in _MODES]
-            raise InputError("autoreset_mode", value=autoreset_mode, rule="must be a known mode", choices=choices) from error
+        self._mode = checked_mode(autoreset_mode)
         self._compose(num_envs, render_mode, options)
         self.num_envs = num_envs
         self.single_observation_space, self.single_action_space = self._spaces()
@@ -241,6 +236,15 @@ class TactileVectorEnv(_Task, gymnasium.vector.VectorEnv):
         final = {"reward_terms": terms, "success": out.success & has_ended, "failed": out.failed & has_ended}
         info = _infos(self.num_envs, final)
         return {"final_obs": last, "_final_obs": has_ended, "final_info": info, "_final_info": has_ended.copy()}
+
+
+def checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
+    """``AutoresetMode`` of a name; ``InputError`` with the choices for one that there is not."""
+    try:
+        return AutoresetMode(mode)
+    except ValueError as error:
+        choices = [mode.value for mode in AutoresetMode]
+        raise InputError("autoreset_mode", value=mode, rule="must be a known mode", choices=choices) from error
 
 
 def serve_vector(pipe: Connection, kind: type[TactileVectorEnv], num_envs: int, options: dict[str, Any]) -> None:

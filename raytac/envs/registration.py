@@ -21,14 +21,21 @@ _MODULES: Final = {
 }
 _VERSIONS: Final = {"PushCube": 0, "BalancePole": 1, "LiftCube": 2, "RollBall": 1, "InsertPeg": 0, "OpenDrawer": 0}
 """Version of each task, named by Gymnasium to who asks for an older one; see its docstring."""
+TASKS: Final = tuple(_VERSIONS)
+"""Names of the tasks."""
 _NAMES: Final = {name: f"raytac/{name}-v{version}" for name, version in _VERSIONS.items()}
 IDS: Final = tuple(_NAMES.values())
 """Names for ``gymnasium.make`` and ``make_vec`` once ``raytac.envs`` is imported."""
+_WARP_NAMES: Final = {name: f"raytac/{name}Warp-v{version}" for name, version in _VERSIONS.items()}
+WARP_IDS: Final = tuple(_WARP_NAMES.values())
+"""Names for ``gymnasium.make_vec`` of the same tasks on MuJoCo Warp, with PyTorch tensors."""
 
 
 def register_envs() -> None:
-    """Register all, each as one environment and as a vector, without a time limit around it."""
+    """Register all, alone, as a vector and as one of tensors, without a time limit around it."""
     for name, module in _MODULES.items():
         if _NAMES[name] not in gymnasium.registry:
             where = f"raytac.envs.{module}:{name}"
             gymnasium.register(_NAMES[name], entry_point=f"{where}Env", vector_entry_point=f"{where}VectorEnv")
+            vector = "raytac.envs.warp_vector:WarpVectorEnv"
+            gymnasium.register(_WARP_NAMES[name], vector_entry_point=vector, kwargs={"task": name})

@@ -9,11 +9,13 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
 from raytac.envs.environments import TactileVectorEnv, serve_vector
 from raytac.envs.processes import Workers
+from raytac.envs.warp_vector import WarpVectorEnv
 from raytac.errors import InputError
 
 Observations = dict[str, np.ndarray]
@@ -46,14 +48,16 @@ class _DictVecEnv(VecEnv):
 
 
 class TactileVecEnv(_DictVecEnv):
-    """A ``TactileVectorEnv`` as a ``VecEnv``: dictionary observations, for ``MultiInputPolicy``.
+    """A ``TactileVectorEnv`` or a ``WarpVectorEnv`` as a ``VecEnv``: dictionary observations, for ``MultiInputPolicy``.
+
+    Stable-baselines3 takes arrays of NumPy: those of a ``WarpVectorEnv`` are copied to the host in every step.
 
     ``infos`` hold ``success``, ``failed``, ``TimeLimit.truncated``, and ``terminal_observation`` of episodes that have ended. One that
     ended because its physics broke down is not ``TimeLimit.truncated``: a learner must not expect a return from beyond it.
-    ``seed(s)`` before ``reset`` seeds environment b with s + b.
+    ``seed(s)`` before ``reset`` seeds environment b with s + b, and a ``WarpVectorEnv`` with s.
     """
 
-    def __init__(self, env: TactileVectorEnv) -> None:
+    def __init__(self, env: TactileVectorEnv | WarpVectorEnv) -> None:
         """Wrap ``env``; InputError unless it resets environments in the step that ends them."""
         mode = env.metadata["autoreset_mode"]
         if mode is not AutoresetMode.SAME_STEP:
@@ -64,10 +68,11 @@ class TactileVecEnv(_DictVecEnv):
 
     def reset(self) -> Observations:
         """Begin episodes in all environments, with the seeds that ``seed`` has set."""
-        observation, _ = self.env.reset(seed=self._seeds)
+        is_warp = isinstance(self.env, WarpVectorEnv)
+        observation, _ = self.env.reset(seed=self._seeds[0] if is_warp else self._seeds)  # type: ignore[arg-type]
         self._reset_seeds()
         self._reset_options()
-        return observation
+        return _on_host(observation)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions for ``step_wait``."""
@@ -75,7 +80,7 @@ class TactileVecEnv(_DictVecEnv):
 
     def step_wait(self) -> Step:
         """Step with the actions kept; InputError names an environment not finite or out of bounds."""
-        return _vec_env_step(*self.env.step(self._actions))
+        return _vec_env_step(*(_on_host(one) for one in self.env.step(self._actions)))
 
 
 class ProcessVecEnv(_DictVecEnv):
@@ -128,6 +133,13 @@ class ProcessVecEnv(_DictVecEnv):
         self._workers.close()
 
 
+def _on_host(values: Any) -> Any:
+    """Arrays of NumPy in place of tensors, in dictionaries too."""
+    if isinstance(values, dict):
+        return {name: _on_host(value) for name, value in values.items()}
+    return values.cpu().numpy() if isinstance(values, torch.Tensor) else values
+
+
 def _joined(parts: Sequence[Observations]) -> Observations:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
@@ -141,5 +153,8 @@ def _vec_env_step(
         for success, failed, cut in zip(info["success"], info["failed"], truncated, strict=True)
     ]
     for b in np.flatnonzero(terminated | truncated):
-        infos[b]["terminal_observation"] = info["final_obs"][b]
+        final = info["final_obs"]
+        infos[b]["terminal_observation"] = (
+            {name: values[b].copy() for name, values in final.items()} if isinstance(final, dict) else final[b]
+        )
     return observation, reward.astype(np.float32), terminated | truncated, infos

@@ -33,12 +33,10 @@ from raytac.world.warp_world import WarpWorld
 
 @dataclass(frozen=True)
 class WarpStep:
-    """Result of a step of B environments; tensors (B,) or (B, …).
-
-    Where an episode has ended, the observation is the next one's first.
-    """
+    """Result of a step of B environments; tensors (B,) or (B, …)."""
 
     observation: dict[str, torch.Tensor]
+    """The first one of an episode that has begun in this step."""
     reward: torch.Tensor
     terminated: torch.Tensor
     truncated: torch.Tensor
@@ -47,10 +45,12 @@ class WarpStep:
     success: torch.Tensor
     failed: torch.Tensor
     """Environments whose physics broke down: truncated, with reward 0."""
+    final: dict[str, torch.Tensor] | None = None
+    """Observation before episodes begin, if it was asked for."""
 
 
 class WarpBatch:
-    """B environments of one task, whose episodes begin again in the step in which they end.
+    """B environments of one task.
 
     .. code-block:: python
 
@@ -152,6 +152,7 @@ class WarpBatch:
         placed = {name: wp.from_torch(poses) for name, poses in self._placed.items()}
         self._begin_graph = self._captured(lambda: self._launch_begin(ended, placed))
         self._step_graph = self._captured(self._launch_step)
+        self._look_graph = (lambda: None) if self.touch is None else self._captured(self.touch.launch)
         self._begun = False
 
     @property
@@ -179,36 +180,70 @@ class WarpBatch:
         """Wrench (B, 6) on every sensor in the last step, pad frame [N, N m], until the next."""
         return {name: self._wrenches[:, k] for k, name in enumerate(self._names)}
 
-    def reset(self, seed: int | None = None) -> dict[str, torch.Tensor]:
-        """Begin all episodes and return the observation; ``seed`` makes all that is drawn from now on repeatable."""
+    def reset(self, seed: int | None = None, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+        """Begin episodes and return the observation of all.
+
+        Args:
+            seed: makes all that is drawn from now on repeatable.
+            mask: environments (B,), bool; None for all. The others keep their last observation of touch.
+
+        Raises ``InputError`` for a mask of another shape or type, and for one that leaves out environments before all have begun once.
+        """
+        if mask is not None:
+            self._check_mask("mask", mask)
+            if not self._begun:
+                raise InputError("mask", value="given", rule="must be None in the first reset")
         if seed is not None:
             self._generator.manual_seed(seed)
-        self._ended.fill_(True)
         with self._stream():
-            self._begin()
+            self._begin(torch.ones_like(self._ended) if mask is None else mask.to(self.device))
             self._begun = True
-            return self._observe()
+            return self._observe(mask)
 
-    def step(self, actions: torch.Tensor) -> WarpStep:
+    def step(self, actions: torch.Tensor, begin: torch.Tensor | None = None, *, final: bool = False) -> WarpStep:
         """One control step; ``actions`` (B, size) are cut to [−1, 1], and NaN is 0.
 
+        Args:
+            actions: of all environments.
+            begin: environments (B,), bool, that begin an episode in place of this step, with reward 0; the others go on, ended or not.
+                None: episodes begin again in the step in which they end.
+            final: observe also what the step led to, before episodes begin: surfaces, markers and images are computed twice.
+
         Raises:
-            InputError: actions of another shape, or no ``reset`` before.
+            InputError: arrays of another shape, or no ``reset`` before.
         """
         if tuple(actions.shape) != (self.num_envs, self.size):
             raise InputError("actions", value=tuple(actions.shape), rule=f"must have shape {(self.num_envs, self.size)}")
         if not self._begun:
             raise InputError("reset", value="not called", rule="must be called before the first step")
+        if begin is not None:
+            self._check_mask("begin", begin)
         actions = torch.nan_to_num(actions.detach().to(self.device, torch.float64)).clamp(-1.0, 1.0)
         with self._stream():
             self._aim(actions)
             self._step_graph()
             self._progress.advance(self._state["tool"].clone(), self._body_now().clone(), actions)
+            if final:
+                self._look_graph()
             failed = ~self._active
             end = self._progress.outcome(self.wrench, self._gap(), self._state["speed"], failed, self.max_episode_steps)
-            torch.logical_or(end.terminated, end.truncated, out=self._ended)
-            self._begin()
-            return WarpStep(self._observe(), end.reward, end.terminated, end.truncated, end.terms, end.success, failed)
+            seen = self._observe(~failed) if final else None
+            reward, terms = end.reward, end.terms
+            terminated, truncated, success = end.terminated, end.truncated, end.success
+            began: torch.Tensor = torch.logical_or(terminated, truncated)
+            if begin is not None:
+                began = begin.to(self.device)
+                terms = {name: torch.where(began, 0.0, term) for name, term in terms.items()}
+                reward = torch.where(began, 0.0, reward)
+                terminated, truncated, success, failed = (one & ~began for one in (terminated, truncated, success, failed))
+            self._begin(began)
+            observation = self._observe(began if final else began | self._active)
+            return WarpStep(observation, reward, terminated, truncated, terms, success, failed, seen)
+
+    def _check_mask(self, name: str, mask: torch.Tensor) -> None:
+        if tuple(mask.shape) != (self.num_envs,) or mask.dtype != torch.bool:
+            rule = f"must be a mask of {self.num_envs} environments"
+            raise InputError(name, value=(tuple(mask.shape), str(mask.dtype)), rule=rule)
 
     def check(self) -> None:
         """Wait for the device. Raises ``InputError`` if contacts were lost for want of memory."""
@@ -228,8 +263,9 @@ class WarpBatch:
             self._control.grip(actions)
             self._opening.copy_(self._control.gap[:, None])
 
-    def _begin(self) -> None:
-        """Begin episodes where one has ended, by a mask: whether one has, the host does not know."""
+    def _begin(self, mask: torch.Tensor) -> None:
+        """Begin episodes by a mask (B,): whether there are any, the host does not know."""
+        self._ended.copy_(mask)
         starts, ended = self._draw(), self._ended
         bodies, pad = starts.bodies, self.task.stands_on
         if self._variation is not None:
@@ -261,13 +297,13 @@ class WarpBatch:
         for (kind, name), column in self._varied.items():
             column.copy_(getattr(drawn, kind)[name])
 
-    def _observe(self) -> dict[str, torch.Tensor]:
-        """Observations of all environments, float32 and images of 8 bit."""
+    def _observe(self, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+        """Observations of all environments, float32 and images of 8 bit; touch of those of a mask (B,), None for all."""
         result, self.body_observation = self._progress.observation(self._gap()), self._progress.body_observation()
         if self.body_seen:
             result["body"] = self.body_observation
         if self.touch is not None:
-            result |= self.touch.observe()
+            result |= self.touch.observe(mask)
         return result
 
     def _gap(self) -> torch.Tensor:

@@ -15,6 +15,7 @@ import warp as wp
 from raytac.envs.warp_cameras import WarpCameras
 from raytac.errors import InputError
 from raytac.gel.surface import make_grid
+from raytac.gel.traction import cell_areas, spread_force
 from raytac.markers import MarkerPerturbation
 from raytac.markers.base import MarkersConfig
 from raytac.markers.ink_kernels import DeviceInk
@@ -93,32 +94,37 @@ class WarpTouch:
         for pad in self.pads.values():
             pad.check()
 
-    def observe(self) -> dict[str, torch.Tensor]:
-        """Observations (B, …) after ``launch``: ``<sensor>_<modality>``; with a stack once a step."""
+    def observe(self, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+        """Observations (B, …) after ``launch``: ``<sensor>_<modality>``.
+
+        ``mask`` (B,): environments that are observed, None for all; the others keep their last observation, and their stacks do not move.
+        """
         result = {}
         for k, (name, settings) in enumerate(self._settings.items()):
             values = {"wrench": self._wrenches[:, k]}
             if name in self._sensors:
-                values |= self._sensors[name].observe()
+                values |= self._sensors[name].observe(values["wrench"])
             for modality in settings.modalities:
-                value, scale = values[modality], self._scales.get((name, modality))
-                value = value if scale is None else (value / scale).float()
-                result[f"{name}_{modality}"] = self._stacked(f"{name}_{modality}", value, settings.stack)
-        self._fresh = torch.zeros_like(self._fresh)
+                key, scale = f"{name}_{modality}", self._scales.get((name, modality))
+                value = values[modality] if scale is None else (values[modality] / scale).float()
+                if settings.stack > 1:
+                    value = self._stacked(key, value, settings.stack)
+                if mask is not None and key in self._last:
+                    value = torch.where(_rows(mask, value), value, self._last[key])
+                self._last[key] = value
+                result[key] = value.clone()  # a learner may write to it
+        self._fresh = torch.zeros_like(self._fresh) if mask is None else self._fresh & ~mask
         return result
 
     def _stacked(self, key: str, now: torch.Tensor, count: int) -> torch.Tensor:
         """The last ``count`` observations as ``TactileObserver`` stacks them; all the present one where an episode has begun."""
-        if count == 1:
-            return now
         is_image = key.endswith("_rgb")
         first = now.repeat(1, 1, 1, count) if is_image else now[:, None].repeat(1, count, *(1 for _ in now.shape[1:]))
-        if key in self._last:
-            last = self._last[key]
-            moved = torch.cat([last[..., 3:], now], dim=-1) if is_image else torch.cat([last[:, 1:], now[:, None]], dim=1)
-            first = torch.where(self._fresh.reshape(-1, *(1 for _ in first.shape[1:])), first, moved)
-        self._last[key] = first
-        return first
+        if key not in self._last:
+            return first
+        last = self._last[key]
+        moved = torch.cat([last[..., 3:], now], dim=-1) if is_image else torch.cat([last[:, 1:], now[:, None]], dim=1)
+        return torch.where(_rows(self._fresh, first), first, moved)
 
 
 class _SensorTouch:
@@ -156,12 +162,16 @@ class _SensorTouch:
             if self._images is not None:
                 self._ink = DeviceInk(grid, spec.markers.radius, num_envs=count, device=str(device))
         self._at_rest: torch.Tensor | None = None
-        if {"height", "indentation", "contact"} & set(settings.modalities):
+        if {"height", "indentation", "contact", "traction"} & set(settings.modalities):
             matrices = CellMeans(grid.shape, settings.map_shape).matrices()
             self._rows, self._columns = (torch.tensor(one, dtype=torch.float32, device=generator.device) for one in matrices)
+            x, y, area = (
+                torch.tensor(one, dtype=torch.float32, device=generator.device) for one in (grid.x, grid.y, cell_areas(grid))
+            )
+            self._nodes = x, y, area
 
-    def observe(self) -> dict[str, torch.Tensor]:
-        """All modalities but the wrench, in SI units."""
+    def observe(self, wrench: torch.Tensor) -> dict[str, torch.Tensor]:
+        """All modalities but the ``wrench`` (B, 6), in SI units."""
         result, wanted = {}, self._settings.modalities
         if self._settings.needs_markers:
             result["markers"], result["marker_visible"] = self._tracked()
@@ -171,6 +181,10 @@ class _SensorTouch:
             result["indentation"] = self._means(self._rest - self._height)
         if "contact" in wanted:
             result["contact"] = self._means(self._contact.float())
+        if "traction" in wanted:
+            force, indentation = wrench.float(), self._rest - self._height
+            spread = spread_force(self._nodes, self._contact != 0, indentation, force, force[:, 5], about_origin=True)
+            result["traction"] = self._means(spread.movedim(-1, 1)).movedim(1, -1)
         if "rgb" in wanted:
             result["rgb"] = self._image()
         return result
@@ -230,3 +244,8 @@ def _without_perturbation(markers: MarkersConfig | None) -> tuple[MarkersConfig 
         rule = "must not shift or turn the pattern on the device"
         raise InputError("perturbation", value=drawn, rule=rule, choices=("noise_px", "dropout"))
     return replace(markers, perturbation=None), drawn
+
+
+def _rows(mask: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    """A mask (B,) in the shape that chooses rows of values (B, …)."""
+    return mask.reshape(-1, *(1 for _ in values.shape[1:]))

@@ -216,6 +216,8 @@ class TactileObserver:
                 return self._scaled(name, self._map(frame, frame.surface.height))
             case "indentation":
                 return self._scaled(name, self._map(frame, frame.surface.indentation))
+            case "traction":
+                return self._scaled(name, self._map(frame, frame.traction))
             case "wrench":
                 return self._scaled(name, frame.wrench)
         raise AssertionError(name)  # the settings know the names
@@ -306,7 +308,7 @@ class TactileObserver:
 
 
 class CellMeans:
-    """Means over (rows, columns) cells of values at nodes (B, Ny, Nx), each in one cell."""
+    """Means over (rows, columns) cells of values at nodes (B, Ny, Nx, …), each in one cell."""
 
     def __init__(self, nodes: tuple[int, int], cells: tuple[int, int]) -> None:
         """Raises ``InputError`` if there are more cells than nodes."""
@@ -318,10 +320,11 @@ class CellMeans:
         self._counts = [np.diff(np.append(s, n)) for s, n in zip(self._starts, nodes, strict=True)]
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Means (B, rows, columns), float64."""
+        """Means (B, rows, columns, …), float64."""
         summed = np.add.reduceat(values, self._starts[0], axis=1, dtype=float)
         summed = np.add.reduceat(summed, self._starts[1], axis=2)
-        return summed / (self._counts[0][:, None] * self._counts[1])
+        counts = self._counts[0][:, None] * self._counts[1]
+        return summed / counts.reshape(*counts.shape, *(1 for _ in values.shape[3:]))
 
     def matrices(self) -> tuple[np.ndarray, np.ndarray]:
         """Matrices P (rows, Ny) and Q (Nx, columns) with which the means are P v Q."""

@@ -17,7 +17,7 @@ from raytac.optics.registry import chosen_optics
 from raytac.sensor.options import LARGEST_SIDE, checked_resolution
 from raytac.specs.sensor import SensorSpec
 
-MODALITIES = ("rgb", "markers", "marker_visible", "height", "indentation", "contact", "wrench")
+MODALITIES = ("rgb", "markers", "marker_visible", "height", "indentation", "contact", "traction", "wrench")
 """Names that ``modalities`` accepts:
 
 - ``rgb``: the camera's image, uint8, (H, W, 3);
@@ -26,15 +26,17 @@ MODALITIES = ("rgb", "markers", "marker_visible", "height", "indentation", "cont
 - ``height``: height of the surface over the pad frame's origin, (rows, columns);
 - ``indentation``: height at rest minus height, (rows, columns); negative where the gel bulges;
 - ``contact``: share of a cell that is in contact, (rows, columns), 0 to 1;
+- ``traction``: force on the pad per area of a cell, pad frame, (rows, columns, 3);
 - ``wrench``: force on the pad and torque about the pad frame's origin, pad frame, (6,).
 """
 SCALES: Mapping[str, float | tuple[float, ...]] = {
     "markers": 1e-3,
     "height": 1e-3,
     "indentation": 1e-3,
+    "traction": 1e4,
     "wrench": (10.0, 10.0, 10.0, 0.1, 0.1, 0.1),
 }
-"""Divisors that bring values to the order of 1: lengths [m], force [N] and torque [N m]."""
+"""Divisors that bring values to the order of 1: lengths [m], traction [Pa], force [N] and torque [N m]."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ class ObservationSettings:
     difference: bool = False
     """Make ``rgb`` (255 + image − image at rest) // 2: 127 where nothing changed, no overflow."""
     map_shape: tuple[int, int] = (32, 32)
-    """(rows, columns) of ``height``, ``indentation``, ``contact``; at most the grid's nodes."""
+    """(rows, columns) of maps: ``height``, ``contact`` and so on; at most the grid's nodes."""
     stack: int = 1
     """Number of last observations that are stacked, oldest first.
 
@@ -122,7 +124,7 @@ class ObservationSettings:
     @property
     def outputs(self) -> tuple[str, ...]:
         """Outputs of a ``TactileSensor`` that are needed besides the surface, which is always there."""
-        return tuple(name for name in ("rgb", "wrench") if name in self.modalities)
+        return tuple(name for name in ("rgb", "traction", "wrench") if name in self.modalities)
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,7 @@ def array_specs(sensor: SensorSpec, settings: ObservationSettings) -> dict[str, 
         "height": ArraySpec(tuple(settings.map_shape), np.float32, -np.inf, np.inf),
         "indentation": ArraySpec(tuple(settings.map_shape), np.float32, -np.inf, np.inf),
         "contact": ArraySpec(tuple(settings.map_shape), np.float32, 0.0, 1.0),
+        "traction": ArraySpec((*settings.map_shape, 3), np.float32, -np.inf, np.inf),
         "wrench": ArraySpec((6,), np.float32, -np.inf, np.inf),
     }
     return {name: _stacked(name, specs[name], settings.stack) for name in settings.modalities}
