@@ -1,4 +1,6 @@
-"""Contacts between rigid bodies beside rigid pads: a gap is closed by a step exactly, and a penetration is taken back slowly.
+"""Contacts between rigid bodies beside rigid pads.
+
+A gap is closed by a step exactly, and a penetration is taken back slowly.
 
 MuJoCo finds a contact when bodies overlap already. With long steps a body falls into a table, a corner that lifts by a micrometre has no
 contact for a step and falls again, and what rests chatters. Here contacts are known up to a margin before they close, and the constraint
@@ -20,11 +22,11 @@ import mujoco
 import numpy as np
 
 HARD_MARGIN = 3e-3
-"""Margin of such geoms [m]: by how much bodies may near each other in a step and not overlap at its end."""
+"""Margin of such geoms [m]: largest approach in a step that leaves no overlap at its end."""
 
 
 def is_hard(model: mujoco.MjModel) -> np.ndarray:
-    """True (ngeom,) for geoms with this law: those of bodies that a task scene names. No other geom has their margin and priority."""
+    """True (ngeom,) for geoms of bodies that a task scene names, which alone follow this law."""
     return (model.geom_margin == HARD_MARGIN) & (model.geom_priority == 1)
 
 

@@ -1,4 +1,4 @@
-"""Kernels on the memory of MuJoCo's states: frames and velocities, contacts of gels and their constraint rows, forces.
+"""Kernels on the memory of MuJoCo's states: frames, contacts of gels, rows, forces.
 
 One thread works on one environment's arena, in which contacts and rows lie one after the other.
 """
@@ -28,7 +28,7 @@ _FITS = wp.constant(wp.float64(0.005))
 _BESIDE = wp.constant(wp.float64(1e-4))
 """Distance from a box from which a point of a gap is not on it [m]."""
 _OPEN = wp.constant(wp.float64(2e-5))
-"""Gap that a contact without friction has before and after a step [m]; what carries load is closed nearer than that."""
+"""Gap [m] of a contact without friction before and after a step; load closes it nearer."""
 _FAR = wp.constant(wp.float64(1.0))
 """Gap that no step closes [m]."""
 _SLOWEST = wp.constant(wp.float64(1e-9))
@@ -42,7 +42,7 @@ _1 = wp.constant(wp.float64(1.0))
 
 @wp.struct
 class Memory:
-    """Addresses of B states, and where their members lie: offsets of pointers [8 byte] and of numbers [4 byte]."""
+    """Addresses of B states, and offsets of pointers [8 byte] and numbers [4 byte] in them."""
 
     states: wp.array(dtype=wp.uint64)
     nq: wp.int32
@@ -140,7 +140,7 @@ def read_frames(
     # outputs
     frames: Frames,
 ):
-    """Frames of pads, at their sites, and of bodies, with their velocities and free accelerations.
+    """Frames of pads, at their sites, and of bodies, with velocities and free accelerations.
 
     ``bodies``: those that carry the pads first; ``roots``: of their kinematic trees; ``last``: last degree of freedom that moves each, −1
     of none; ``parents``: of the degrees of freedom; ``share``: of each one's acceleration that comes, as damping is implicit
@@ -179,7 +179,7 @@ def read_frames(
 
 @wp.kernel
 def write_contacts(memory: Memory, steps: Steps, slots: Slots, gels: wp.array(dtype=wp.int32), others: wp.array(dtype=wp.int32)):
-    """Fill the last contacts with those of the slots that are held. ``gels``, ``others``: geoms of the pads and of all that they touch."""
+    """Fill the last contacts with the slots'; ``gels``, ``others``: geoms of pads and bodies."""
     i = wp.tid()
     if steps.lost[i] != 0 or steps.contacts[i] == 0:
         return
@@ -284,8 +284,10 @@ def passes(
     memory: Memory, env: wp.int32, one: wp.int32, two: wp.int32, boxes: wp.array(dtype=wp.vec3d), near: wp.vec3d, far: wp.vec3d,
     moved: wp.vec3d,
 ) -> wp.bool:  # fmt: skip
-    """True if a contact's points ``near`` and ``far`` of two boxes are not on them, or neither is on the other box once the second box
-    has moved so that the gap is closed."""
+    """True if two boxes pass each other, so that their gap is no contact once it is closed.
+
+    Its points ``near`` and ``far`` are not on the boxes, or neither is on the other box once the second one has moved.
+    """
     off = wp.max(beside_box(memory, env, one, boxes[one], near), beside_box(memory, env, two, boxes[two], far))
     by = wp.min(beside_box(memory, env, one, boxes[one], far + moved), beside_box(memory, env, two, boxes[two], near - moved))
     return wp.max(off, by) > _BESIDE
@@ -293,7 +295,7 @@ def passes(
 
 @wp.kernel
 def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(dtype=wp.int32), boxes: wp.array(dtype=wp.vec3d)):
-    """Set the reference accelerations after ``mj_referenceConstraint``: of the last rows, and of contacts of geoms that are ``hard``.
+    """Set reference accelerations of the last rows and ``hard`` geoms, after MuJoCo's own.
 
     ``boxes``: half edges of geoms that are boxes, else 0.
     """
@@ -347,7 +349,7 @@ def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(
 
 @wp.kernel
 def correct_lifts(memory: Memory, steps: Steps, slots: Slots):
-    """Set the lifts in environments with a slide that begins or ends by the speeds of MuJoCo for the end of the step.
+    """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step.
 
     A slide that is faster by a lift that is larger asks for more: the first guess follows from the contact's own mass, the others by
     secants. ``steps.slides`` stays 1 until the lift fits.

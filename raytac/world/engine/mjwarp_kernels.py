@@ -1,4 +1,4 @@
-"""Kernels on the state of MuJoCo Warp: frames and velocities, contacts of gels and their constraint rows, forces.
+"""Kernels on the state of MuJoCo Warp: frames, contacts of gels, rows, forces.
 
 MuJoCo Warp keeps the states of all environments in arrays of float32, and their contacts in one list. Its cone has one ratio of
 regularisations for all contacts, R₁/R₀ = 1/impratio. A gel's contact has its own. With the second and third axis of the contact's frame
@@ -33,7 +33,7 @@ _FITS = wp.constant(wp.float64(0.005))
 _BESIDE = wp.constant(wp.float32(1e-4))
 """Distance from a box from which a point of a gap is not on it [m]."""
 _OPEN = wp.constant(wp.float32(2e-5))
-"""Gap that a contact without friction has before and after a step [m]; what carries load is closed nearer than that."""
+"""Gap [m] of a contact without friction before and after a step; load closes it nearer."""
 _FAR = wp.constant(wp.float32(1.0))
 """Gap that no step closes [m]."""
 _SLOWEST = wp.constant(wp.float32(1e-6))
@@ -49,7 +49,7 @@ _1 = wp.constant(wp.float64(1.0))
 
 @wp.struct
 class Worlds:
-    """Arrays of MuJoCo Warp's model and data that the kernels read and write, under its own names."""
+    """Arrays of MuJoCo Warp's model and data that kernels read and write, by its names."""
 
     sparse: wp.int32
     """1 where it keeps the Jacobian of constraints sparse."""
@@ -141,7 +141,7 @@ def place_states(
     worlds: Worlds,
     active: wp.array(dtype=wp.bool),
 ):
-    """Set positions (B, nq) and controls (B, nu) of the environments that are ``chosen``, which are active from now on."""
+    """Set positions (B, nq) and controls (B, nu) of ``chosen`` environments; now active."""
     i = wp.tid()
     if chosen[i]:
         active[i] = True
@@ -196,9 +196,9 @@ def choose_worlds(
     done: wp.array(dtype=wp.int32),
     steps: Steps,
 ):
-    """Every environment has its own row; left out are those that are not ``active`` or have done all steps of the scene.
+    """Choose a step's environments: ``active`` ones that have steps of the scene to do.
 
-    ``ticks`` of each of the ``scene_steps``; ``launched``: steps before this one, of all ``launches``.
+    Every environment has its own row. ``ticks`` of each of the ``scene_steps``; ``launched``: steps before this one, of all ``launches``.
     """
     i = wp.tid()
     if launched == 0:
@@ -219,7 +219,7 @@ def read_elapsed(done: wp.array(dtype=wp.int32), tick: wp.float64, elapsed: wp.a
 
 @wp.kernel
 def end_worlds(steps: Steps, done: wp.array(dtype=wp.int32), active: wp.array(dtype=wp.bool)):
-    """Count the ticks of a step; an environment whose physics broke down in it is no longer ``active``."""
+    """Count the ticks of a step; where physics broke down, clear ``active``."""
     i = wp.tid()
     if steps.envs[i] >= 0:
         done[i] = done[i] + steps.ticks[i]
@@ -245,11 +245,11 @@ def read_frames(
     # outputs
     frames: Frames,
 ):
-    """Frames of pads, at their sites, and of bodies, with their velocities and free accelerations.
+    """Frames of pads, at their sites, and of bodies, with velocities and free accelerations.
 
     ``bodies``: those that carry the pads first; ``last``: last degree of freedom that moves each, −1 of none; ``share``: of the
-    acceleration of each that comes, as damping is implicit (``ImplicitDamping``). As in a constraint row, the accelerations hold nothing of
-    what velocities alone give.
+    acceleration of each that comes, as damping is implicit (``ImplicitDamping``). As in a constraint row, the accelerations hold nothing
+    of what velocities alone give.
     """
     i, k = wp.tid()
     body = bodies[k]
@@ -334,7 +334,7 @@ def append_contacts(
 
 @wp.kernel
 def write_rows(worlds: Worlds, steps: Steps, slots: Slots, own: Own):
-    """Set stiffness and reference acceleration of the gels' rows, after MuJoCo has made them; scaled by t (see the module)."""
+    """Set stiffness and reference acceleration of MuJoCo's rows of gels, scaled by t (module)."""
     i, pad, body = wp.tid()
     k = own.contact[i, pad, body]
     if k < 0:
@@ -443,7 +443,7 @@ def write_hard_references(
 
 @wp.kernel
 def begin_correction(worlds: Worlds, steps: Steps, own: Own):
-    """Note where slides are not known yet; the next solve, which differs by a lift, begins with this solution."""
+    """Note where slides are unknown; the next solve, with another lift, begins with this one."""
     i = wp.tid()
     own.sliding[i] = steps.slides[i]
     steps.slides[i] = 0
@@ -453,7 +453,7 @@ def begin_correction(worlds: Worlds, steps: Steps, own: Own):
 
 @wp.kernel
 def correct_lifts(worlds: Worlds, own: Own, steps: Steps, slots: Slots):
-    """Set the lifts in environments with a slide that begins or ends by the speeds of MuJoCo for the end of the step.
+    """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step.
 
     A slide that is faster by a lift that is larger asks for more: the first guess follows from the contact's own mass, the others by
     secants. ``steps.slides`` stays 1 until the lift fits.
@@ -496,7 +496,7 @@ def correct_lifts(worlds: Worlds, own: Own, steps: Steps, slots: Slots):
 def add_damping(
     worlds: Worlds, steps: Steps, always: wp.int32, damped: wp.array2d(dtype=wp.float32), mass: wp.array2d(dtype=wp.float32)
 ):
-    """Keep the mass matrix, and put that with the damping of a step where gels touch, or ``always`` (see ``implicit_damping``)."""
+    """Keep the mass matrix; add damping where gels touch or ``always`` (``implicit_damping``)."""
     i, k = wp.tid()
     mass[i, k] = worlds.M[i, k]
     if (always != 0 or steps.contacts[i] > 0) and steps.lost[i] == 0:
@@ -505,8 +505,9 @@ def add_damping(
 
 @wp.kernel
 def end_states(worlds: Worlds, saved: Saved, steps: Steps, losses: wp.int32, peaks: wp.array(dtype=wp.int32)):
-    """Mark environments whose physics broke down, and put them and those left out back to where the step began.
+    """Mark environments whose physics broke down; put them and those left out back.
 
+    They go to where the step began.
     A number is not finite then, a joint is far too fast, or MuJoCo Warp has lost contacts for want of memory, as one of the flags
     ``losses`` says: of the list that all share it cannot say whose.
 
