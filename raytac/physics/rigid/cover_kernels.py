@@ -1,8 +1,11 @@
-"""Area for which the nodes at an outline stand, in Warp: so that a body's force does not jump where its outline passes nodes.
+"""Area for which the nodes at an outline stand, in Warp.
+
+With it a body's force does not jump where its outline passes nodes.
 
 A node amid others that count stands for a quarter of each of its four cells. Of a cell through which the outline runs, the part that the
-body covers is shared by those corners that count (marching squares): straight between the places where the outline crosses the edges of the
-cell, with a corner where one corner of the cell alone is in. Where the gap rises gently to one that does not count, there is no outline.
+body covers is shared by those corners that count (marching squares): straight between the places where the outline crosses the edges of
+the cell, with a corner where one corner of the cell alone is in. Where the gap rises gently to one that does not count, there is no
+outline.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -22,10 +25,11 @@ from raytac.physics.rigid.shape_kernels import BOX, CYLINDER, Shapes, infinity
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _ON_EDGE, _IN_CELL = wp.constant(wp.int32(5)), wp.constant(wp.int32(2))
-"""Halvings of an edge and of a cell's diagonal on which the outline is looked for, unless all parts are boxes: a side of ten nodes of 150
-is off by 0.1 % of them."""
+"""Halvings of an edge, and of a cell's diagonal, on which an outline is searched for.
+
+Not if all parts are boxes. A side of ten nodes of 150 is off by 0.1 % of them."""
 _GENTLE = wp.constant(wp.float64(2.0))
-"""Rise of the gap from node to node, over the spacing, up to which there is no outline; twice as much is one."""
+"""Rise of the gap over the spacing up to which there is no outline; twice as much is one."""
 _SLACK = wp.constant(wp.float64(1e-9))
 """By this [m] rounding leaves out no box that begins where another ends."""
 _0 = wp.constant(wp.float64(0.0))
@@ -37,7 +41,7 @@ _INF = wp.constant(wp.float64(float("inf")))
 
 @wp.struct
 class Outline:
-    """Where the gap of a body is below what counts, on a window of nodes."""
+    """Outline of where the gap of a body is below what counts, on a window of nodes."""
 
     lines: wp.array(dtype=wp.vec3d)
     """Of ``Pads``."""
@@ -70,7 +74,7 @@ def corner_of(outline: Outline, i: wp.int32, j: wp.int32, corner: wp.int32) -> w
 
 @wp.func
 def end_in_box(entry: wp.mat33d, length: wp.vec3d, below: wp.float64, start: wp.vec3d, step: wp.vec3d) -> wp.float64:
-    """``end_of`` one box, from ``entries_of`` it: it counts where its entries are below its exits and the top, all straight lines."""
+    """``end_of`` one box from ``entries_of`` it: its entries are below its exits and the top."""
     share = wp.float64(1.0)
     at, rise = entry * wp.vec3d(start[0], start[1], _1), entry * wp.vec3d(step[0], step[1], _0)
     top = start[2] + below
@@ -87,7 +91,7 @@ def end_in_box(entry: wp.mat33d, length: wp.vec3d, below: wp.float64, start: wp.
 def end_in_boxes(
     shapes: Shapes, placed: Placed, block: wp.int32, below: wp.float64, start: wp.vec3d, step: wp.vec3d
 ) -> wp.float64:  # fmt: skip
-    """``end_of`` a body that is boxes: that of the last one into which the line goes from one to the other."""
+    """``end_of`` a body of boxes: that of the last one that the line reaches from box to box."""
     share = wp.float64(0.0)
     for _ in range(placed.count[block]):
         before = wp.float64(share)
@@ -133,8 +137,10 @@ def crossing(
     shapes: Shapes, placed: Placed, block: wp.int32, outline: Outline, i: wp.int32, j: wp.int32, to_x: wp.int32, to_y: wp.int32,
     near: wp.float64, steep: wp.float64,
 ) -> wp.float64:  # fmt: skip
-    """``end_of`` the edge between a node with a gap ``near`` and the next one along x or y, from the one that counts; half of it where
-    the gap is gentle."""
+    """``end_of`` the edge from a node that counts, with a gap ``near``, to the next one.
+
+    It is half of the edge where the gap is gentle.
+    """
     if steep == _0:
         return _HALF
     one, two = place_of(outline, i, j), place_of(outline, i + to_x, j + to_y)
@@ -148,7 +154,10 @@ def covered(
     shapes: Shapes, placed: Placed, block: wp.int32, outline: Outline, i: wp.int32, j: wp.int32, gap: wp.vec4d, steep: wp.vec4d,
     share: wp.vec4d, inside: wp.int32,
 ) -> wp.float64:  # fmt: skip
-    """Covered part of a cell of which 1 to 3 corners count. ``steep`` and ``share``: of the edges from each corner to the next."""
+    """Covered part of a cell of which 1 to 3 corners count.
+
+    ``steep`` and ``share``: of the edges from each corner to the next.
+    """
     area, crossed = wp.float64(0.0), wp.int32(0)
     for k in range(4):
         if (gap[k] < outline.below) != (gap[(k + 1) % 4] < outline.below):
@@ -195,7 +204,7 @@ def add_outline(
     # outputs
     sums: wp.array(dtype=Sums),
 ):  # fmt: skip
-    """Add to the bins by how much the nodes of a window stand for more or less than a quarter of each of their cells.
+    """Add to the bins the excess of a window's nodes over a quarter of each of their cells.
 
     ``window``: first node along x and y and nodes along each, of a pad's grid. ``gap`` [m]: of each, which counts ``below`` one [m].
     ``ends``: memory for one more node than there are along x and y. Others as of ``add_node``.

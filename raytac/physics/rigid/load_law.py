@@ -109,9 +109,14 @@ class LoadLaw:
         deepest: float = np.inf,
         cells: np.ndarray | None = None,
     ) -> None:
-        """``gap`` (Ny, Nx) [m]: distance along z from the resting gel to the object at first touch, >= 0, ``inf`` where there
-        is none, at evenly spaced places ``x`` (Nx,) and ``y`` (Ny,) in the pad frame [m]; ``deepest`` [m]: where there is gel for, at most
-        the pad's thickness; ``cells`` (Ny, Nx): cells for which each place stands, one each and on the pad's edges half of one if None."""
+        """Law from the gap between the resting gel and the object at first touch.
+
+        Args:
+            gap: (Ny, Nx) [m], along z, >= 0, ``inf`` where there is no object.
+            x, y: evenly spaced places (Nx,) and (Ny,) in the pad frame [m].
+            deepest: greatest depth that there is gel for [m], at most the pad's thickness.
+            cells: cells for which each place stands, (Ny, Nx); None: one each, half of one on the pad's edges.
+        """
         self._gelpad = gelpad
         self.deepest = min(deepest, gelpad.thickness)
         """Greatest depth that a press may have [m]."""
@@ -232,7 +237,7 @@ def region_lines(
 
 
 def cells_of(x: np.ndarray, y: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
-    """Cells for which each place stands, (Ny, Nx): one on an edge of the pad for half of one, one in a corner for a quarter."""
+    """Cells for which each place stands, (Ny, Nx): 1, 1/2 on an edge, 1/4 in a corner."""
     at_x, at_y = (np.where(np.abs(v) > 0.5 * size - _AT_EDGE, 0.5, 1.0) for v, size in zip((x, y), gelpad.size, strict=True))
     return at_y[:, None] * at_x
 

@@ -85,7 +85,7 @@ class Work:
     gap: wp.array2d(dtype=wp.float64)
     """Gaps of a window's nodes [m], (blocks, most nodes)."""
     ends: wp.array2d(dtype=wp.vec2f)
-    """Where the outline crosses the edges from each node on along x and y, of their length."""
+    """Crossings of the outline with the edges from each node along x and y, of their length."""
     ahead: wp.float64
     """See ``PadSearch``."""
 
