@@ -12,7 +12,6 @@ from typing import Any
 import torch
 import warp as wp
 
-from raytac.envs.warp_cameras import WarpCameras
 from raytac.errors import InputError
 from raytac.gel.surface import make_grid
 from raytac.gel.traction import cell_areas, spread_force
@@ -20,8 +19,9 @@ from raytac.markers import MarkerPerturbation
 from raytac.markers.base import MarkersConfig
 from raytac.markers.ink_kernels import DeviceInk
 from raytac.markers.pattern import MarkerPattern
-from raytac.observe import DeviceImages, ObservationSettings, TactileObserver
+from raytac.observe import DeviceImages, ObservationSettings, Randomization, TactileObserver
 from raytac.observe.observer import CellMeans
+from raytac.observe.randomization import response_curves
 from raytac.world.pad_touch import PadTouch
 from raytac.world.warp_world import WarpWorld
 
@@ -249,3 +249,38 @@ def _without_perturbation(markers: MarkersConfig | None) -> tuple[MarkersConfig 
 def _rows(mask: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     """A mask (B,) in the shape that chooses rows of values (B, …)."""
     return mask.reshape(-1, *(1 for _ in values.shape[1:]))
+
+
+class WarpCameras:
+    """``CameraDrift`` with draws from one generator of the device: cameras of B environments."""
+
+    def __init__(self, randomization: Randomization, gamma: float, num_envs: int, generator: torch.Generator) -> None:
+        """Draw all cameras; ``gamma`` is the exponent of the sensor's camera."""
+        self._settings, self._gamma, self._generator = randomization, gamma, generator
+        self._curves = torch.zeros((num_envs, 3, 256), dtype=torch.float32, device=generator.device)
+        first = 256 * torch.arange(3 * num_envs, dtype=torch.int32, device=generator.device)
+        self._first = first.reshape(num_envs, 1, 1, 3)
+        self.begin(torch.ones(num_envs, dtype=torch.bool, device=generator.device))
+
+    @classmethod
+    def of(cls, observer: TactileObserver, generator: torch.Generator) -> WarpCameras | None:
+        """Cameras of an observer; None if they do not differ."""
+        if not observer.randomization.changes_images:
+            return None
+        return cls(observer.randomization, observer.sensor.response.gamma, observer.num_envs, generator)
+
+    def begin(self, mask: torch.Tensor) -> None:
+        """Draw the cameras of the environments of a mask (B,)."""
+        shape, device = (len(self._curves), 5), self._curves.device
+        u = torch.rand(shape, generator=self._generator, dtype=torch.float64, device=device)
+        curves = response_curves(2.0 * u - 1.0, self._settings, self._gamma)
+        self._curves = torch.where(mask[:, None, None], curves.float(), self._curves)
+
+    def apply(self, images: torch.Tensor, *, noise: bool = True) -> torch.Tensor:
+        """8-bit images (B, H, W, 3) of these cameras; ``noise``: add the noise of a frame."""
+        entry = (self._first + images).reshape(-1)
+        values = self._curves.reshape(-1).index_select(0, entry).reshape(images.shape)
+        if noise and self._settings.noise:
+            drawn = torch.randn(images.shape, generator=self._generator, device=images.device)
+            values = values + self._settings.noise * drawn
+        return (values + 0.5).clamp(0.0, 255.0).to(torch.uint8)
