@@ -141,7 +141,7 @@ class TaskBatch:
 
     @property
     def tool(self) -> np.ndarray:
-        """Poses (B, 4, 4) of the tool after the last step; an environment that failed keeps its last one."""
+        """Poses (B, 4, 4) of the tool after the last step, or before the step in which it failed."""
         return self._progress.tool.copy()
 
     @property

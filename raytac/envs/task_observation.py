@@ -43,7 +43,7 @@ def body_from_tool(tool: Array, body: Array, speed: Array) -> Array:
 def observation_arrays(
     actions: int, *, has_grip: bool, body_seen: bool, observers: Mapping[str, TactileObserver]
 ) -> dict[str, ArraySpec]:
-    """Shape, type and bounds of every observation of one environment: ``state``, ``goal``, perhaps ``body``, ``<sensor>_<modality>``.
+    """Shape, type and bounds of every observation of one environment.
 
     Args:
         actions: size of an action.

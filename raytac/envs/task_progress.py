@@ -1,4 +1,4 @@
-"""``TaskProgress``: where the episodes of B environments are, from the poses after each step to reward, ends and observation.
+"""``TaskProgress``: episodes of B environments, from poses to reward, ends and observation.
 
 Arrays of NumPy, or of PyTorch on any device.
 """
@@ -60,7 +60,7 @@ class TaskProgress:
         self.steps *= ~mask
 
     def advance(self, tool: Array, body: Array, action: Array) -> None:
-        """Take over the poses (B, 4, 4) after a step, which the caller overwrites no more, and its actions (B, k)."""
+        """Take over poses (B, 4, 4) after a step, which stay as they are, and its actions (B, k)."""
         dt = self._duration
         moved, turned = self._errors((body, self.body), (tool, self.start_tool))
         self._speed, self.body_speed, self._turn = (tool[:, :3, 3] - self.tool[:, :3, 3]) / dt, moved / dt, turned[:, 3:]

@@ -1,4 +1,4 @@
-"""Scene of a task with the sensors that a batch reads: what of them is drawn once for the world, and their observers."""
+"""Scene of a task with the sensors that a batch reads, drawn once for the world."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class TaskSensors:
         num_envs: int,
         seed: int,
     ) -> TaskSensors:
-        """Load the scene and draw what all environments share; arguments and errors as of ``TaskBatch``."""
+        """Load the scene and draw what all environments share; arguments as of ``TaskBatch``."""
         settings = _settings(task.tactile if isinstance(tactile, str) and tactile == "task" else tactile)
         drawn = Randomization() if randomization is None else check_kind("randomization", randomization, Randomization)
         loaded = scene if isinstance(scene, TaskScene) else load_task(task.scene if scene is None else scene)
@@ -61,13 +61,13 @@ class TaskSensors:
 
     @property
     def pitch(self) -> float:
-        """Pitch [m] as fine as the images, if there are any, between the coarsest allowed one and 0.4 mm."""
+        """Pitch [m] as fine as the images, if there are any, and at most 0.4 mm."""
         if "rgb" not in self.probe.settings.modalities:
             return _PITCH
         return max(COARSEST_PITCH, min(_PITCH, *self.probe.sensor.camera.pitch_at(self.probe.layout.rendered)))
 
     def observers(self, names: Sequence[str]) -> dict[str, TactileObserver]:
-        """An observer of every sensor by its name, with what is drawn at every reset or in every frame; none without touch."""
+        """Observers by sensor, with what a reset or a frame draws; none without touch."""
         if self.settings is None:
             return {}
         episode = replace(self.randomization, led_power=0.0, led_colour=0.0, reflectance=0.0, youngs_modulus=0.0, friction=0.0)
@@ -79,7 +79,7 @@ class TaskSensors:
 
 
 def sensor_seed(seed: int, sensor: int) -> int:
-    """Seed of a sensor of an environment; never that of a neighbouring environment, whose seed is the next number."""
+    """Seed of a sensor of an environment; no neighbour, whose seed is the next number, has it."""
     return seed + (sensor << 64)
 
 

@@ -1,4 +1,4 @@
-"""Variations of an episode: masses, friction, gels and mountings of environments, drawn at every reset."""
+"""Variations of an episode: masses, friction, gels and mountings, drawn at every reset."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class VariationRanges:
 
 
 class VariationSampler:
-    """Seeded variations of B environments, from one random stream an environment: its draws do not depend on B."""
+    """Seeded variations, from one random stream an environment: draws do not depend on B."""
 
     def __init__(self, ranges: VariationRanges, *, num_envs: int = 1, seed: int = 0) -> None:
         """Seed the streams, that of environment b with ``seed`` + b; draw nothing yet."""
@@ -79,7 +79,7 @@ class VariationSampler:
 
 
 def on_mounted_pad(body: str, bodies: Mapping[str, Array], pad: Array, mounting: Array) -> dict[str, Array]:
-    """Starts of bodies where ``body`` keeps its pose relative to the pad that it stands on: it is shifted and tilted with its mounting.
+    """Starts of bodies where ``body`` is shifted and tilted with the pad that it stands on.
 
     Args:
         body: name of the body that stands on the pad.

@@ -1,4 +1,4 @@
-"""``WarpCameras``: cameras of B environments whose exposure, white balance, exponent and noise differ, as tensors on one device."""
+"""``WarpCameras``: cameras of B environments that differ, as tensors on one device."""
 
 # pyright: reportMissingImports=false
 # (PyTorch belongs to the extra "rl", which the tests do without.)

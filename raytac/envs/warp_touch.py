@@ -78,12 +78,12 @@ class WarpTouch:
             pad.launch(self._world.contact, self._world.engine.active)
 
     def forget(self, mask: wp.array) -> None:
-        """Launch that the pads of the environments of a mask (B,), bool, forget what they went through."""
+        """Launch that pads of the environments of a mask (B,), bool, forget their history."""
         for pad in self.pads.values():
             pad.reset(mask)
 
     def begin(self, mask: torch.Tensor) -> None:
-        """Begin episodes in the environments of a mask (B,): empty their stacks and draw their cameras again."""
+        """Empty the stacks and draw the cameras of the environments of a mask (B,)."""
         self._fresh |= mask
         for sensor in self._sensors.values():
             if sensor.cameras is not None:
@@ -117,7 +117,7 @@ class WarpTouch:
         return result
 
     def _stacked(self, key: str, now: torch.Tensor, count: int) -> torch.Tensor:
-        """The last ``count`` observations as ``TactileObserver`` stacks them; all the present one where an episode has begun."""
+        """The last ``count`` observations, all the present one where an episode has begun."""
         is_image = key.endswith("_rgb")
         first = now.repeat(1, 1, 1, count) if is_image else now[:, None].repeat(1, count, *(1 for _ in now.shape[1:]))
         if key not in self._last:
@@ -190,7 +190,7 @@ class _SensorTouch:
         return result
 
     def _tracked(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Displacements (B, M, 2) [m] with noise, 0 of markers that are lost, and 1 (B, M) of those that are not."""
+        """Displacements (B, M, 2) [m] with noise, 0 of lost markers, and 1 (B, M) of the others."""
         moved, drawn = self._markers, self._perturbation
         visible = torch.ones(moved.shape[:2], dtype=torch.int8, device=moved.device)
         if drawn.noise_px:
@@ -236,7 +236,7 @@ class _SensorTouch:
 
 
 def _without_perturbation(markers: MarkersConfig | None) -> tuple[MarkersConfig | None, MarkerPerturbation]:
-    """Model of markers on the device, and its perturbation. Raises ``InputError`` for a pattern that moves."""
+    """Model of markers and its perturbation; InputError for a pattern that moves."""
     drawn = None if markers is None else markers.perturbation
     if markers is None or drawn is None:
         return markers, MarkerPerturbation()

@@ -140,7 +140,7 @@ def randomised_bodies(scene: TaskScene, randomization: Randomization, seed: int)
 
 
 def response_curves(draws: Any, randomization: Randomization, gamma: float) -> Any:
-    """8-bit values of n cameras by value of the nominal one, (n, 3, 256); arrays of NumPy or PyTorch.
+    """Values of n cameras by 8-bit value of the nominal one, (n, 3, 256), NumPy or PyTorch.
 
     Args:
         draws: uniform random numbers (n, 5) in [−1, 1): exposure, white balance of three channels, exponent.

@@ -1,4 +1,4 @@
-"""``DeviceVariation``: masses, friction, gels and mountings of the environments of MuJoCo Warp, changed on the device by a mask."""
+"""``DeviceVariation``: numbers of MuJoCo Warp's environments, changed by a mask."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class DeviceVariation:
     """
 
     def __init__(self, composed: WorldModel, engine: MujocoWarp, contact: GelContact) -> None:
-        """Note the nominal numbers of the scene. Raises ``InputError`` for a free body that carries others."""
+        """Note the scene's nominal numbers; InputError for a free body that carries others."""
         model, self._device, envs = composed.model, engine.device, engine.num_envs
         touched, sensors = composed.touched, composed.sensors
         free = [body for body in touched if body.is_free]
@@ -99,7 +99,7 @@ class DeviceVariation:
         self, name: str, array: Any, which: Sequence[int] | np.ndarray | range, columns: Sequence[int] | range,
         nominal: np.ndarray, *, divides: int = 0,
     ) -> None:  # fmt: skip
-        """Let the factors ``which`` of ``name`` change columns of an array, whose numbers lie one after the other."""
+        """Let the factors ``which`` of ``name`` change columns of a contiguous array."""
         if not len(columns):
             return
         # MuJoCo Warp's vectors are float32 one after the other.
@@ -111,7 +111,7 @@ class DeviceVariation:
         self._scaled[name].append(_Scaled(self.arrays[name], of, into, start, divides, values))
 
     def launch(self, chosen: wp.array, names: Sequence[str]) -> None:
-        """Launch the changes that ``names`` of ``arrays`` make in the environments that are ``chosen`` (B,), bool."""
+        """Launch what ``names`` of ``arrays`` change in environments ``chosen`` (B,), bool."""
         for name in names:
             if name == "mounting":
                 inputs = [chosen, self.arrays[name], self._carriers, self._poses, self._place, self._turn]

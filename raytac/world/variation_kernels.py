@@ -1,4 +1,4 @@
-"""Kernels of ``DeviceVariation``: numbers of environments that factors multiply, and mountings of pads."""
+"""Kernels of ``DeviceVariation``: numbers that factors multiply, and mountings of pads."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -25,7 +25,7 @@ def scale_columns(
     # outputs
     values: wp.array2d(dtype=Any),
 ):
-    """Set columns (n,) of ``values`` (B, …) to the nominal numbers (n,) times, or over, the factors ``which`` (n,) name."""
+    """Set columns (n,) of ``values`` to the nominal numbers times, or over, factors ``which``."""
     i, k = wp.tid()
     if chosen[i]:
         factor = factors[i, which[k]]
@@ -43,7 +43,7 @@ def mount_pads(
     place: wp.array2d(dtype=wp.vec3),
     turn: wp.array2d(dtype=wp.quat),
 ):
-    """Poses of the bodies (pads,) that carry the pads: the nominal ones (pads,) times ``mounting`` (B, pads, 4, 4)."""
+    """Poses of the bodies that carry the pads: nominal ones (pads,) times ``mounting``."""
     i, k = wp.tid()
     if not chosen[i]:
         return
