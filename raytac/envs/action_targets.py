@@ -81,7 +81,6 @@ def joint_targets(motion: Motion, actions: Array, target: Array, joints: Array, 
     They move by up to the motion's ``joint_step``, lead the joints by at most its ``joint_leash`` and stay within the joints' limits.
 
     Args:
-        motion: the motion.
         actions: in [−1, 1].
         target, joints: targets before and present positions (B, n) [rad].
         limits: lower and upper one of each joint (n, 2) [rad].

@@ -74,8 +74,6 @@ class TaskBatch:
         """Compose the world; ``reset`` begins the episodes.
 
         Args:
-            task: the task.
-            num_envs: number of environments B.
             physics, device: as of ``TactileWorld``.
             tactile: observation of every sensor: settings, or modalities alone; "task" takes those of the task; with None no sensor is
                 read and nothing of it is computed.
@@ -141,7 +139,7 @@ class TaskBatch:
 
     @property
     def tool(self) -> np.ndarray:
-        """Poses (B, 4, 4) of the tool after the last step, or before the step in which it failed."""
+        """Poses (B, 4, 4) of the tool after the last step; a failed environment keeps its last."""
         return self._progress.tool.copy()
 
     @property

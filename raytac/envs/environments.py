@@ -171,8 +171,7 @@ class TactileVectorEnv(_Task, gymnasium.vector.VectorEnv):
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Begin episodes: of all environments, or of those in ``options["reset_mask"]`` (B,).
 
-        Raises:
-            InputError: seeds of another number than environments, a mask of another shape, or after ``close``.
+        Raises ``InputError``: seeds of another number than environments, a mask of another shape, or after ``close``.
         """
         self._check_open()
         mask = (options or {}).get("reset_mask")

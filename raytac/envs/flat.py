@@ -58,7 +58,6 @@ class FlatVector:
 
         Args:
             kind: the task's vector, such as ``PushCubeVectorEnv``.
-            num_envs: number of environments B.
             history: number of steps whose observations the actor is given.
             hidden: modalities that neither is given, though ``tactile`` names them: for pictures.
             seed: of environment 0; environment b has seed + b.

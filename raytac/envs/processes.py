@@ -50,7 +50,6 @@ class Workers:
             serve: function that a process runs, with (pipe, kind, number of environments, options); see ``serve_vector``.
             kind: what makes a vector.
             num_envs: number of environments in all, the same number in each process.
-            processes: number of processes.
             seed: of process 0; process k has seed + k num_envs / processes, so that no two environments have the same random stream.
             options: of ``kind``; they must pickle.
 

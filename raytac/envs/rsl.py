@@ -43,10 +43,8 @@ class RslVecEnv(VecEnv):
 
         Args:
             kind: the task's vector, such as ``PushCubeVectorEnv``.
-            num_envs: number of environments in all.
             processes: processes that these are spread over, each with a world of its own; 0 is this process.
             device: of the tensors; that of the worlds is among ``options``, as ``world_device``.
-            reward_scale: factor of the reward.
             seed: of environment 0; environment b has seed + b.
             options: ``history`` of ``FlatVector``, and those of ``TaskBatch``.
 
@@ -98,8 +96,7 @@ class RslVecEnv(VecEnv):
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
         """Step all environments with actions (B, k), cut to [−1, 1]; those that end begin again.
 
-        Raises:
-            InputError: actions that are not finite; the message names the environment.
+        Raises ``InputError``: actions that are not finite; the message names the environment.
         """
         values = actions.detach().cpu().numpy()
         if not np.isfinite(values).all():
@@ -164,7 +161,6 @@ class RslWarpEnv(VecEnv):
             kind: the task's vector, such as ``PushCubeVectorEnv``.
             num_envs, device, seed: as of ``WarpBatch``.
             history: number of steps whose observations the actor is given.
-            reward_scale: factor of the reward.
             options: of ``WarpBatch``; ``body_seen`` is whether the actor sees the body.
 
         Raises ``InputError`` as ``WarpBatch``.

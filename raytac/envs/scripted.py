@@ -38,7 +38,7 @@ def roll_ball(batch: TaskBatch) -> np.ndarray:
 
 
 def balance_pole(batch: TaskBatch) -> np.ndarray:
-    """Linear quadratic regulator of a pole on a cart: x, ẋ, θ, θ̇, ẍ; θ̈ = 3g/2L θ − 3/2L ẍ."""
+    """Linear quadratic regulator of a thin pole on a cart: θ̈ = 3g/2L θ − 3/2L ẍ."""
     axis, spin = batch.body[:, :3, 2], batch.body_speed[:, 3:]
     lean, rate = axis[:, :2], np.stack([spin[:, 1], -spin[:, 0]], axis=1)
     commanded = batch.action[:, :2] * 2e-3 / batch.control_timestep
@@ -85,7 +85,7 @@ def open_drawer(batch: TaskBatch) -> np.ndarray:
 
 
 def _grasp(batch: TaskBatch, off: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pads that hold something (B,), and actions (B, 4) to go ``off`` [m] (B, 3) and close."""
+    """Pads that hold something (B,), and actions (B, 4) to close ``off`` [m] (B, 3) away."""
     force = np.minimum(*(-batch.world.state().wrench[name][:, 2] for name in ("left", "right")))
     grasped, over, down = force > 3.0, np.linalg.norm(off[:, :2], axis=1) < 2e-3, np.abs(off[:, 2]) < 2e-3
     action = np.zeros((len(off), 4))

@@ -45,11 +45,10 @@ def observation_arrays(
 ) -> dict[str, ArraySpec]:
     """Shape, type and bounds of every observation of one environment.
 
+    They are ``state``, ``goal``, perhaps ``body``, and ``<sensor>_<modality>``.
+
     Args:
-        actions: size of an action.
         has_grip: there is a gap between two pads.
-        body_seen: the body is observed.
-        observers: of the sensors by name.
     """
     sizes = {"state": 9 + has_grip + actions, "goal": 3} | ({"body": 15} if body_seen else {})
     specs = {name: ArraySpec((n,), np.float32, -np.inf, np.inf) for name, n in sizes.items()}

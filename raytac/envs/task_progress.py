@@ -1,4 +1,4 @@
-"""``TaskProgress``: episodes of B environments, from poses to reward, ends and observation.
+"""``TaskProgress``: episodes of B environments, from poses to reward, ends, observation.
 
 Arrays of NumPy, or of PyTorch on any device.
 """
@@ -6,13 +6,41 @@ Arrays of NumPy, or of PyTorch on any device.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from array_api_compat import array_namespace
 
 from raytac.envs.task_observation import body_from_tool, state_and_goal
-from raytac.envs.task_outcome import TaskOutcome, task_outcome
 from raytac.envs.task_rules import Array, Task, TaskState
 from raytac.robots.pose_errors import PoseErrors
+
+
+@dataclass(frozen=True)
+class TaskOutcome:
+    """Outcome of a step; arrays (B,)."""
+
+    reward: Array
+    terminated: Array
+    truncated: Array
+    terms: dict[str, Array]
+    """Terms of the reward by name."""
+    success: Array
+
+
+def task_outcome(task: Task, state: TaskState, steps: Array, max_episode_steps: int, failed: Array) -> TaskOutcome:
+    """Outcome of a step; rewards have the type of the state's goals.
+
+    Args:
+        state: after the step.
+        steps: since the start of each episode (B,); at ``max_episode_steps`` it is truncated.
+        failed: environments (B,) whose physics broke down: truncated, with reward 0.
+    """
+    xp, result = array_namespace(state.goal), task.evaluate(state)
+    nothing = xp.zeros_like(state.goal[:, 0])
+    terms = {name: xp.where(failed, 0.0, nothing + term) for name, term in result.terms.items()}
+    terminated = result.terminated & ~failed
+    truncated = (failed | (steps >= max_episode_steps)) & ~terminated
+    return TaskOutcome(sum(terms.values(), nothing), terminated, truncated, terms, result.success & ~failed)
 
 
 class TaskProgress:
@@ -33,7 +61,6 @@ class TaskProgress:
         """Begin where the scene does.
 
         Args:
-            task: the task.
             tool, body: poses (B, 4, 4) in the scene, float64.
             steps: zeros (B,), whole numbers.
             actions: size k of an action.
@@ -60,7 +87,7 @@ class TaskProgress:
         self.steps *= ~mask
 
     def advance(self, tool: Array, body: Array, action: Array) -> None:
-        """Take over poses (B, 4, 4) after a step, which stay as they are, and its actions (B, k)."""
+        """Take the poses (B, 4, 4) after a step, not overwritten any more, and actions (B, k)."""
         dt = self._duration
         moved, turned = self._errors((body, self.body), (tool, self.start_tool))
         self._speed, self.body_speed, self._turn = (tool[:, :3, 3] - self.tool[:, :3, 3]) / dt, moved / dt, turned[:, 3:]
@@ -77,8 +104,6 @@ class TaskProgress:
             wrench: on every sensor (B, 6), pad frame.
             opening: gap between two pads (B, 1) [m]; (B, 0) without a gripper.
             joint_speed: (B, n) [rad/s].
-            failed: environments (B,) whose physics broke down.
-            max_episode_steps: at which an episode is truncated.
         """
         state = TaskState(
             tool=self.tool,

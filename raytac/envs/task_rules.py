@@ -25,7 +25,7 @@ class Motion:
     """Motion that an action commands of the tool: the pad, or the midpoint of two pads."""
 
     axes: tuple[str, ...]
-    """Components of the action along and about world axes (``x``, ``rx``, …), then ``grip``."""
+    """Components of the action: ``x``, … along, ``rx``, … about world axes; last ``grip``, gap."""
     step: tuple[float, ...]
     """Change of the target in a control step for an action of 1 [m, rad]."""
     low: tuple[float, float, float]

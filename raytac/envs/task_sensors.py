@@ -1,4 +1,4 @@
-"""Scene of a task with the sensors that a batch reads, drawn once for the world."""
+"""Scene of a task with the sensors that a batch reads, and their observers."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ class TaskSensors:
 
     @property
     def pitch(self) -> float:
-        """Pitch [m] as fine as the images, if there are any, and at most 0.4 mm."""
+        """Pitch [m] as fine as images, if any, between the coarsest allowed and 0.4 mm."""
         if "rgb" not in self.probe.settings.modalities:
             return _PITCH
         return max(COARSEST_PITCH, min(_PITCH, *self.probe.sensor.camera.pitch_at(self.probe.layout.rendered)))
 
     def observers(self, names: Sequence[str]) -> dict[str, TactileObserver]:
-        """Observers by sensor, with what a reset or a frame draws; none without touch."""
+        """Observer of every sensor by name, with randomised cameras; none without touch."""
         if self.settings is None:
             return {}
         episode = replace(self.randomization, led_power=0.0, led_colour=0.0, reflectance=0.0, youngs_modulus=0.0, friction=0.0)
@@ -79,7 +79,7 @@ class TaskSensors:
 
 
 def sensor_seed(seed: int, sensor: int) -> int:
-    """Seed of a sensor of an environment; no neighbour, whose seed is the next number, has it."""
+    """Seed of an environment's sensor; never a neighbour's, whose seed is the next number."""
     return seed + (sensor << 64)
 
 

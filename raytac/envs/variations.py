@@ -1,4 +1,4 @@
-"""Variations of an episode: masses, friction, gels and mountings, drawn at every reset."""
+"""Variations of masses, friction, gels and mountings, drawn at every reset."""
 
 from __future__ import annotations
 
@@ -27,7 +27,6 @@ class VariationRanges:
         """Name what varies.
 
         Args:
-            scene: scene whose bodies vary.
             sensors: names of the sensors whose gels and mountings vary.
             randomization: half widths; ``body_mass``, ``body_friction``, ``youngs_modulus``, ``friction``, ``pad_shift`` and ``pad_turn``
                 of it are used.
@@ -60,7 +59,7 @@ class VariationRanges:
 
 
 class VariationSampler:
-    """Seeded variations, from one random stream an environment: draws do not depend on B."""
+    """Seeded variations of B environments, one stream each: draws do not depend on B."""
 
     def __init__(self, ranges: VariationRanges, *, num_envs: int = 1, seed: int = 0) -> None:
         """Seed the streams, that of environment b with ``seed`` + b; draw nothing yet."""
@@ -82,7 +81,6 @@ def on_mounted_pad(body: str, bodies: Mapping[str, Array], pad: Array, mounting:
     """Starts of bodies where ``body`` is shifted and tilted with the pad that it stands on.
 
     Args:
-        body: name of the body that stands on the pad.
         bodies: name to ``world_from_body`` (n, 4, 4).
         pad: pose (4, 4) of the pad as designed.
         mounting: ``nominal_from_pad`` (n, 4, 4).

@@ -1,4 +1,7 @@
-"""``WarpCameras``: cameras of B environments that differ, as tensors on one device."""
+"""``WarpCameras``: cameras of B environments that differ, as tensors on one device.
+
+Exposure, white balance, exponent and noise differ.
+"""
 
 # pyright: reportMissingImports=false
 # (PyTorch belongs to the extra "rl", which the tests do without.)

@@ -78,12 +78,12 @@ class WarpTouch:
             pad.launch(self._world.contact, self._world.engine.active)
 
     def forget(self, mask: wp.array) -> None:
-        """Launch that pads of the environments of a mask (B,), bool, forget their history."""
+        """Launch that the pads of a mask (B,), bool, forget the past."""
         for pad in self.pads.values():
             pad.reset(mask)
 
     def begin(self, mask: torch.Tensor) -> None:
-        """Empty the stacks and draw the cameras of the environments of a mask (B,)."""
+        """Begin episodes of a mask (B,): empty their stacks and draw their cameras again."""
         self._fresh |= mask
         for sensor in self._sensors.values():
             if sensor.cameras is not None:
@@ -190,7 +190,7 @@ class _SensorTouch:
         return result
 
     def _tracked(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Displacements (B, M, 2) [m] with noise, 0 of lost markers, and 1 (B, M) of the others."""
+        """Displacements (B, M, 2) [m] with noise, 0 where lost, and 1 (B, M) where not lost."""
         moved, drawn = self._markers, self._perturbation
         visible = torch.ones(moved.shape[:2], dtype=torch.int8, device=moved.device)
         if drawn.noise_px:
@@ -236,7 +236,7 @@ class _SensorTouch:
 
 
 def _without_perturbation(markers: MarkersConfig | None) -> tuple[MarkersConfig | None, MarkerPerturbation]:
-    """Model of markers and its perturbation; InputError for a pattern that moves."""
+    """Model of markers, and its perturbation; InputError for a pattern that moves."""
     drawn = None if markers is None else markers.perturbation
     if markers is None or drawn is None:
         return markers, MarkerPerturbation()

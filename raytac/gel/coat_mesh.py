@@ -81,8 +81,7 @@ def bind_to_coat(mesh: CoatMesh, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
     Returns vertex numbers (…, 3) and barycentric weights (…, 3).
 
-    Raises:
-        InputError: a point lies off the mesh.
+    Raises ``InputError``: a point lies off the mesh.
     """
     points = np.asarray(xy, float).reshape(-1, 2)
     corners = mesh.rest[mesh.faces][..., :2]

@@ -12,20 +12,7 @@ For work so small that costs more than it saves. Below it the result does not de
 
 def product(a: np.ndarray, b: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
     """a @ b, float32, in pieces small enough to stay on the calling thread."""
-    rows, inner = a.shape
-    columns = b.shape[1]
-    if rows * inner * columns <= _ONE_THREAD:
-        return np.matmul(a, b, out=out)
-    out = np.empty((rows, columns), np.float32) if out is None else out
-    if rows >= columns:
-        step = max(_ONE_THREAD // (inner * columns), 1)
-        for start in range(0, rows, step):
-            out[start : start + step] = a[start : start + step] @ b
-    else:
-        step = max(_ONE_THREAD // (inner * rows), 1)
-        for start in range(0, columns, step):
-            out[:, start : start + step] = a @ b[:, start : start + step]
-    return out
+    return stacked_product(a[None], b, None if out is None else out[None])[0]
 
 
 def stacked_product(a: np.ndarray, b: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:

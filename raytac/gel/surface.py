@@ -137,8 +137,7 @@ def rounded_envs(envs: list[int], batch: int) -> list[int]:
 def chosen_envs(envs: ArrayLike | None, batch: int) -> list[int]:
     """Environment numbers of a mask (B,) or a list, in its order; None names all.
 
-    Raises:
-        InputError: an environment that does not exist, numbers that are not whole, or a mask of the wrong length.
+    Raises ``InputError``: an environment that does not exist, numbers that are not whole, or a mask of the wrong length.
     """
     if envs is None:
         return list(range(batch))

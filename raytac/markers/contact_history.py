@@ -1,4 +1,4 @@
-"""``ContactHistory``: contacts of many pads and their history as arrays of one device, which kernels read and write without the host."""
+"""``ContactHistory``: contacts of many pads and their history, on a device."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ _NAN = wp.mat44d(*[np.nan] * 16)
 
 
 class ContactHistory:
-    """Contacts of B pads on the CPU or on CUDA; the arrays are inputs of ``launch`` up to ``stretch``, then results.
+    """Contacts of B pads on the CPU or on CUDA.
+
+    The arrays are inputs of ``launch`` up to ``stretch``, then results.
 
     Attributes:
         depth: mean indentation of each cell [m], (B, ny, nx), float32; negative where nothing touches.
@@ -41,7 +43,7 @@ class ContactHistory:
         follows_shear: bool = True,
         device: Any = "cpu",
     ) -> None:
-        """Make the arrays; ``reach`` [m] as of ``ContactSettings``, ``slip`` [1/m] and shear as of ``ContactTracker``."""
+        """Make the arrays; ``reach`` [m] as ``ContactSettings``, others as ``ContactTracker``."""
         start_warp()
         self.device, grid = wp.get_device(device), cells.grid
         self.pad: Any = Pad()
@@ -104,10 +106,10 @@ class ContactHistory:
         poses: np.ndarray | None,
         shear: tuple[np.ndarray, np.ndarray] | None,
     ) -> np.ndarray:
-        """Table (n, K, 12) of the contacts of n environments, each named once, on the CPU, with as much room as they need.
+        """Table (n, K, 12) of the contacts of n environments on the CPU, with room for all.
 
         Args:
-            envs: names (n,).
+            envs: names (n,), each once.
             samples: of which ``rows`` (n,) are theirs.
             poses: ``pad_from_object`` (n, 4, 4); None where it is not known.
             shear: centres (n, 3) and stretches (n, 3) of the gel, as of ``contact_kernels.follow``; None where they are not known.
@@ -141,7 +143,7 @@ class ContactHistory:
         wp.launch(forget, dim=self._num_envs, inputs=[mask, self._before, self._pose_before], device=self.device)
 
     def check(self) -> None:
-        """Wait for the device. Raises ``InputError`` if a pad had more contacts than there is memory for."""
+        """Wait for the device. Raises ``InputError`` if a pad had more contacts than memory."""
         most = int(self._most.numpy()[0])
         if most > self.room:
             self._most.zero_()

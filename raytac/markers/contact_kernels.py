@@ -1,4 +1,4 @@
-"""Kernels of ``ContactHistory``: connected contacts of every pad, and the drag and the turn of the object at each since first touch."""
+"""Kernels of ``ContactHistory``: connected contacts, and the object's motion at each."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -53,7 +53,7 @@ class Pad:
 
 @wp.struct
 class Contact:
-    """One contact, as a row of ``Contacts.table``; ``active`` is 0 or 1; ``place``: centre, and height of the pressed gel."""
+    """Contact as a row of ``Contacts.table``; ``place``: centre, and height of the pressed gel."""
 
     active: wp.int32
     place: wp.vec3d
@@ -118,10 +118,10 @@ def join(parent: wp.array2d(dtype=wp.int32), env: wp.int32, a: wp.int32, b: wp.i
 
 @wp.func
 def kept_shares(x: Any, y: Any, steps: wp.int32):
-    """Shares of a shear and of a twist that stick, by both over their limits: those of the closest point of the ellipsoid, in energy.
+    """Shares of a shear and of a twist that stick, by both over their limits.
 
-    Newton's method on 1 / √(x² + y²) = 1, which is a straight line in γ for b = 1, from where the larger of the two alone would be; b as
-    in ``fots``.
+    They are those of the closest point of the ellipsoid, in energy, by Newton's method on 1 / √(x² + y²) = 1. This is a straight line in
+    γ for b = 1, from where the larger of the two alone would be; b as in ``fots``.
     """
     b, one, none = type(x)(_B), type(x)(1.0), type(x)(0.0)
     gamma = wp.max(wp.max(x - one, (y - one) / b), none)
@@ -157,7 +157,7 @@ def contact_of(m: Moments, pad: Pad) -> Contact:
 
 @wp.func
 def slipped(contact: Contact, slip: wp.float64) -> Contact:
-    """A contact with the shear and the twist that it keeps: the closest point, in elastic energy, of the ellipsoid of sticking."""
+    """Contact with the shear and twist that it keeps, by ``kept_shares``."""
     result = contact
     determinant = contact.ellipse[0] * contact.ellipse[2] - contact.ellipse[1] * contact.ellipse[1]
     radius = wp.sqrt(wp.sqrt(wp.max(determinant, wp.float64(1e-24))))
@@ -279,7 +279,7 @@ def choose_object(
     centre: wp.array(dtype=wp.vec3d),
     stretch: wp.array(dtype=wp.vec3d),
 ):
-    """Pose of the object of each pad, and the shear of the gel under it, as ``follow`` takes them; NaN and 0 where they are not known.
+    """Pose of each pad's object and shear of the gel under it, for ``follow``; else NaN and 0.
 
     ``poses`` (B, pads, bodies + pads): ``pad_from_body``; ``depths`` (B, bodies): overlap of each with the pad, of which the deepest is
     the object.
@@ -317,10 +317,11 @@ def follow(
     # outputs
     table: wp.array3d(dtype=wp.float64),
 ):
-    """Add the object's motion since the last surface to the contacts that it carries on, or take the physics' shear.
+    """Add the object's motion to contacts that go on, or take the physics' shear.
 
-    ``envs``: of each row; ``poses``: ``pad_from_object`` of each, NaN where it is not known; ``stretches``: displacement along x and y and
-    rotation of the gel at the ``centres``, which are 0 or NaN where it is not known. ``before``, ``pose_before``: of every environment.
+    ``envs``: of each row; ``poses``: ``pad_from_object`` of each, NaN where it is not known; ``stretches``: displacement along x and y
+    and rotation of the gel at the ``centres``, which are 0 or NaN where it is not known. ``before``, ``pose_before``: of every
+    environment.
     """
     row = wp.tid()
     env, room, pose = envs[row] + 0, contacts.shape[1], poses[row]

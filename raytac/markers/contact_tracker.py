@@ -1,4 +1,4 @@
-"""``ContactTracker``: the contacts of one surface after the other, with the drag and the turn of the object at each since first touch."""
+"""``ContactTracker``: contacts of successive surfaces, with the object's motion at each."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from raytac.markers.contacts import Contacts, ContactSamples, ContactSettings
 
 
 class ContactTracker:
-    """Detects the contacts of each surface in turn and sums up the object's motion at each of them.
+    """Contacts of each surface in turn, with the object's motion summed at each.
 
     A contact is a connected component of the contact mask. From one surface to the next the object moves by D = T_now T_before⁻¹ (pad
     frame). A contact at G, on the pressed gel, adds (D G − G)_xy to its shear and D's rotation about z to its twist. This is the motion
     of the object's material where it touches, which is zero in rolling. A contact is an earlier one if it lies where D carries that one,
     to within its radius and ``ContactSettings.reach``; otherwise it is new and starts from zero. Without contact the history is dropped.
 
-    With ``slip`` c, what exceeds Δs_max = c h̄ A and Δθ_max = ``TWIST_SLIP`` c h̄ slips and is forgotten, so a reversal unloads first. The
-    shear that the physics knows takes the place of the history of the contact that it belongs to.
+    With ``slip`` c, what exceeds Δs_max = c h̄ A and Δθ_max = ``TWIST_SLIP`` c h̄ slips and is forgotten, so a reversal unloads first.
+    The shear that the physics knows takes the place of the history of the contact that it belongs to.
     """
 
     def __init__(self, batch: int, settings: ContactSettings | None = None, *, slip: float | None = None) -> None:
-        """For ``batch`` environments; ``settings``: None is the default ones; ``slip`` [1/m]: None never slips."""
+        """``settings``: None is the default; ``slip`` [1/m]: None never slips."""
         self.batch, self._reach, self._slip = batch, (settings or ContactSettings()).reach, slip
         self._history: ContactHistory | None = None
 
@@ -39,7 +39,7 @@ class ContactTracker:
     def update(
         self, surface: GelSurface, samples: ContactSamples, envs: Sequence[int] | None = None, shear: ContactShear | None = None
     ) -> Contacts:
-        """Contacts of ``surface``, whose ``samples`` are given; arguments and errors as of ``MarkerTracker.update``."""
+        """Contacts of ``surface``; arguments and errors as of ``MarkerTracker.update``."""
         chosen = np.arange(self.batch) if envs is None else np.asarray(envs, int)
         if surface.batch != len(chosen):
             raise InputError("surface", value=surface.batch, rule=f"must have {len(chosen)} environments, as this tracker")

@@ -35,11 +35,7 @@ class DeviceFots:
 
         Args:
             sensor: with markers and their motion.
-            config: of the model.
-            grid: nodes of the surfaces.
-            num_envs: number of pads B.
             patches: most separate contacts of a pad.
-            device: "cpu" or "cuda".
 
         Raises:
             InputError: another model, a perturbation, or a sensor without markers or their motion.
@@ -98,7 +94,7 @@ class DeviceFots:
         self._launch(forget_object, len(self._pressed), [mask, self._pressed])
 
     def check(self) -> None:
-        """Wait for the device. Raises ``InputError`` if a pad had more contacts than there is memory for."""
+        """Wait for the device. Raises ``InputError`` if a pad had more contacts than memory."""
         self.contacts.check()
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:

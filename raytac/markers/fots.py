@@ -89,7 +89,6 @@ class FotsKernel:
             markers: positions at rest [m], (B, M, 2) or (B, M, 3), of which x and y are read.
             depth: indentation of the samples [m], (B, ny, nx), 0 outside the contact.
             boxes, contacts: as ``ContactSamples.boxes`` and ``Contacts.table``, whose last two columns are not read.
-            motion: constants of the pad.
         """
         (batch, count), rows = markers.shape[:2], contacts.shape[1]
         size = batch, count, 1 << (rows - 1).bit_length()

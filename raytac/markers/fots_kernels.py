@@ -1,4 +1,4 @@
-"""Kernels of FOTS: shear and twist that each contact keeps, then the displacement of every marker, one thread each.
+"""Kernels of FOTS: what each contact keeps, and the markers' displacements.
 
 Formulas and sources are those of ``raytac.markers.fots``.
 """
@@ -71,7 +71,7 @@ class Drag:
 
 @wp.kernel
 def limit(table: wp.array3d(dtype=wp.float64), motion: Constants, drags: wp.array2d(dtype=Drag)):
-    """Shear and twist that each contact (B, K) gives to the skin; ``table``: as ``Contacts.table``."""
+    """Shear and twist that each contact (B, K) gives to the coat; see ``Contacts.table``."""
     b, k = wp.tid()
     m = motion
     drag = Drag()
@@ -157,6 +157,17 @@ def first_cell(x: wp.float32, low: wp.int32, high: wp.int32) -> wp.int32:
 
 
 @wp.func
+def within_reach(place: wp.vec2f, box: wp.vec4i, cells: Cells, lam: wp.float32):
+    """Place of a marker [cells]; columns from, to and rows from, to of the box within its reach."""
+    reach = wp.sqrt(_NEGLIGIBLE / lam)
+    dx, dy = cells.pitch[0], cells.pitch[1]
+    at_x, at_y = (place[0] - cells.origin[0]) / dx, (place[1] - cells.origin[1]) / dy
+    c0, c1 = first_cell(at_x - reach / dx, box[0], box[1]), first_cell(at_x + reach / dx, box[0], box[1])
+    r0, r1 = first_cell(at_y - reach / dy, box[2], box[3]), first_cell(at_y + reach / dy, box[2], box[3])
+    return at_x, at_y, c0, c1, r0, r1
+
+
+@wp.func
 def dilated(
     place: wp.vec2f, b: wp.int32, box: wp.vec4i, depth: wp.array3d(dtype=wp.float32), cells: Cells, lam: wp.float32
 ) -> wp.vec2f:
@@ -164,11 +175,8 @@ def dilated(
 
     ``box``: columns from, to and rows from, to; a cell that nothing touches has a negative depth.
     """
-    reach = wp.sqrt(_NEGLIGIBLE / lam)
     dx, dy = cells.pitch[0], cells.pitch[1]
-    at_x, at_y = (place[0] - cells.origin[0]) / dx, (place[1] - cells.origin[1]) / dy
-    c0, c1 = first_cell(at_x - reach / dx, box[0], box[1]), first_cell(at_x + reach / dx, box[0], box[1])
-    r0, r1 = first_cell(at_y - reach / dy, box[2], box[3]), first_cell(at_y + reach / dy, box[2], box[3])
+    at_x, at_y, c0, c1, r0, r1 = within_reach(place, box, cells, lam)
     x, y = wp.float32(0.0), wp.float32(0.0)
     for r in range(r0, r1):
         ey = (at_y - wp.float32(r)) * dy

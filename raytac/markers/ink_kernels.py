@@ -1,4 +1,4 @@
-"""``DeviceInk``: dots that markers print on the surface, on the CPU or on CUDA."""
+"""``DeviceInk``: dots that markers print on the surface, without the host."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -26,7 +26,7 @@ def print_dots(
     # outputs
     ink: wp.array3d(dtype=wp.float32),
 ):
-    """Share of a dot at the nodes within ``reach`` of the nearest one; the greatest of all."""
+    """Shares of dots at nodes up to ``reach`` from each, of which the greatest counts."""
     env, marker = wp.tid()
     centre = centres[env, marker]
     if not (wp.isfinite(centre[0]) and wp.isfinite(centre[1])):
@@ -55,7 +55,10 @@ class DeviceInk:
         self._inputs = [wp.vec2d(float(grid.x[0]), float(grid.y[0])), wp.vec2d(dx, dy), reach, wp.float32(radius), self._ink]
 
     def __call__(self, centres: wp.array) -> wp.array:
-        """Shares (B, Ny, Nx), float32, of dots at ``centres`` (B, M) [m], until the next call."""
+        """Shares (B, Ny, Nx), float32, of dots at ``centres`` (B, M), vectors of float64 [m].
+
+        The next call overwrites them.
+        """
         self._ink.zero_()
         wp.launch(print_dots, dim=centres.shape, inputs=[centres, *self._inputs], device=self._ink.device)
         return self._ink

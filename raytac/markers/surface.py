@@ -43,8 +43,7 @@ class SurfaceModel:
     ) -> np.ndarray:
         """Displacement along x, y and z [m], shape (B, M, 3), of markers at ``rest`` (B, M, 3).
 
-        Raises:
-            InputError: the surface has no coat mesh, or a marker lies off it.
+        Raises ``InputError``: the surface has no coat mesh, or a marker lies off it.
         """
         if surface.coat is None:
             rule = "needs a soft pad (physics='ipc'): a rigid pad has heights only; choose another model, such as fots"

@@ -109,7 +109,6 @@ class MarkerTracker:
             grid: grid of the surfaces to come, of ``num_envs`` environments.
             resolution: (width, height) of the image that pixels refer to [px]; None is the sensor's own.
             device: ``auto``, ``cpu`` or ``cuda``, for models that can use it.
-            seed: seed of the perturbation.
 
         Raises:
             InputError: an unknown model, a sensor without markers or without the marker motion that the model needs, or a shift that
@@ -173,8 +172,7 @@ class MarkerTracker:
         twice advances and draws once. ``shear``: of the gel in one contact of each row, where the physics knows it; models that follow it
         (``MarkersConfig.follows_shear``) then need no earlier surface for that contact.
 
-        Raises:
-            InputError: a surface of another number of environments or another grid, or one that lacks what the model needs.
+        Raises ``InputError``: a surface of another number of environments or another grid, or one that lacks what the model needs.
         """
         count = self.num_envs if envs is None else len(envs)
         if surface.batch != count:

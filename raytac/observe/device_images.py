@@ -59,7 +59,7 @@ class DeviceImages:
         return self._image.upload(surface)
 
     def observe(self, heights: Any, contact: Any = None, ink: Any = None) -> dict[str, Any]:
-        """``rgb`` (B, height, width, 3), uint8, on the device, for ``as_tensors``.
+        """``rgb`` (B, height, width, 3), uint8, on the device; ``as_tensors`` copies nothing.
 
         Args:
             heights: [m], B·Ny·Nx of them on the device, finite, which is not checked: a Dr.Jit array or a float32 PyTorch tensor.

@@ -65,9 +65,7 @@ class TactileObserver:
         Args:
             sensor: name of a shipped sensor, path of a sensor file, or a specification.
             settings: choices of the observation; None is the markers.
-            num_envs: number of environments B.
             randomization: differences between environments and worlds; None is none.
-            seed: of every draw.
 
         Raises:
             InputError: markers of a sensor without, an image too large, a number out of range, or a perturbation of markers that
@@ -174,7 +172,6 @@ class TactileObserver:
 
         Args:
             wrench: wrenches of all environments (B, 6).
-            failed: environments that have failed (B,), bool.
             envs: mask (B,) of environments with new wrenches; the others keep their last observation.
 
         Raises:

@@ -140,11 +140,10 @@ def randomised_bodies(scene: TaskScene, randomization: Randomization, seed: int)
 
 
 def response_curves(draws: Any, randomization: Randomization, gamma: float) -> Any:
-    """Values of n cameras by 8-bit value of the nominal one, (n, 3, 256), NumPy or PyTorch.
+    """8-bit values of n cameras by the nominal one's, (n, 3, 256); NumPy or PyTorch.
 
     Args:
         draws: uniform random numbers (n, 5) in [−1, 1): exposure, white balance of three channels, exponent.
-        randomization: half widths.
         gamma: exponent of the nominal camera.
     """
     xp, r = array_namespace(draws), randomization

@@ -29,8 +29,7 @@ class ArraySpec:
 def array_specs(sensor: SensorSpec, settings: ObservationSettings) -> dict[str, ArraySpec]:
     """Arrays of an observation with ``settings``, by modality.
 
-    Raises:
-        InputError: markers are observed and the sensor has none, or an image is too large.
+    Raises ``InputError``: markers are observed and the sensor has none, or an image is too large.
     """
     count = sensor.markers.rows * sensor.markers.columns
     if settings.needs_markers and not count:
@@ -68,8 +67,7 @@ def gymnasium_space(specs: Mapping[str, ArraySpec]) -> gymnasium.spaces.Dict:
 def as_tensors(observation: Mapping[str, Any]) -> dict[str, Any]:
     """``torch.Tensor`` by name, through DLPack, without a copy; nested dictionaries stay nested.
 
-    Raises:
-        BackendError: PyTorch is not installed.
+    Raises ``BackendError``: PyTorch is not installed.
     """
     try:
         import torch  # pyright: ignore[reportMissingImports]  # gigabytes: the checks run without it

@@ -37,8 +37,6 @@ class DeviceImage:
 
         Args:
             mode: one that renders on the device, as ``DeviceMode`` does.
-            grid: of the heights to come.
-            cut: what is kept.
             difference: give (255 + image − image at rest) // 2 instead of the image.
             ink: share of marker dots at rest (1, Ny, Nx); None without.
 

@@ -142,8 +142,7 @@ class DeviceMode(ABC):
     def prepare(self, grid: PadGrid) -> None:
         """Build what depends on the pad's grid; done at the first frame and kept.
 
-        Raises:
-            InputError: the camera sees beyond the pad, or a second grid.
+        Raises ``InputError``: the camera sees beyond the pad, or a second grid.
         """
         if self._grid is not None:
             names = "x", "y", "rest"
@@ -195,8 +194,7 @@ class DeviceMode(ABC):
         Untouched pads are not rendered again: they show the image at rest, which is rendered once. An environment whose heights are not
         finite fails alone: its ``rgb`` is 0, its other images are NaN, its contact is False.
 
-        Raises:
-            InputError: a surface whose arrays do not have the shape of its grid, an empty batch, one too large, or a second grid.
+        Raises ``InputError``: a surface whose arrays do not have the shape of its grid, an empty batch, one too large, or a second grid.
         """
         return self.start(surface)()
 

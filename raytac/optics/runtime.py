@@ -24,8 +24,7 @@ def load_mitsuba(device: str = "auto") -> tuple[Any, str]:
     Returns the module and the device that it runs on. A process has one variant: types of Mitsuba plugins are bound to the first, and
     ``auto`` stays with it. The first ``cuda`` of a process traces one ray; where that fails, ``auto`` warns and takes the CPU.
 
-    Raises:
-        BackendError: no LLVM library or one too old (CPU), no CUDA that works, or a process that already uses the other variant.
+    Raises ``BackendError``: no LLVM library or one too old (CPU), no CUDA that works, or a process that already uses the other variant.
     """
     resolved = resolve_device(device)
     if resolved == "cpu":
@@ -103,7 +102,7 @@ def _require_llvm() -> None:
 
 
 def share_cores() -> None:
-    """Let Dr.Jit render with at most half of the processor's cores; a smaller number that was set before stays.
+    """Let Dr.Jit use at most half of the cores; a smaller number set before stays.
 
     Its threads wait busily for the next image. Where physics and a policy run between two images, those threads take their cores, and
     libraries whose threads wait for each other then wait for threads that do not run.

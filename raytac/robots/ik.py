@@ -80,7 +80,6 @@ class DifferentialIk:
         """Set the program up.
 
         Args:
-            arm: joints and site.
             max_velocity: greatest |q̇| (n,) or one for all [rad/s or m/s].
             posture: q₀ (n,), joint positions that a redundant arm tends to; None: the middle of the limits, 0 without limits.
             posture_weight: w above, against 1 per metre and 1 per radian of the pose. It moves the site off its target by about
@@ -221,7 +220,6 @@ class PoseServo:
         """Set the law.
 
         Args:
-            arm: joints and site.
             max_velocity: greatest |q̇| (n,) or one for all [rad/s or m/s].
             posture: q₀ (n,); None: no second term.
             posture_gain: g, share of q₀ − q that a step covers.

@@ -19,8 +19,6 @@ class PoseErrors:
         """Arrays of ``count`` B poses, ``pairs`` times.
 
         Args:
-            count: number of poses B.
-            pairs: number of pairs in a call.
             device: None takes NumPy arrays. With a device, such as "cuda:0" or "cpu", poses and results are PyTorch tensors on it, and a
                 call copies nothing to the host; its kernel runs in Warp's present stream.
         """

@@ -98,7 +98,6 @@ def coat_edges(surface: GelSurface, grid: PadGrid, env: int = 0) -> np.ndarray:
     Args:
         surface: with a coat.
         grid: nodes of ``surface`` that are drawn (from ``strided``).
-        env: environment.
     """
     assert surface.coat is not None
     mesh = surface.coat.mesh

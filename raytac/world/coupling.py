@@ -61,7 +61,7 @@ class SolverBody:
     velocity: np.ndarray
     """Velocity of the centre of mass [m/s] and angular velocity [rad/s], (6,)."""
     wrench: np.ndarray
-    """All forces on it with gravity [N], and torques about the centre of mass [N m], (6,)."""
+    """Sum of forces, with gravity [N], and of torques about the centre of mass [N m], (6,)."""
 
 
 @dataclass(frozen=True)

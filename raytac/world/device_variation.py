@@ -1,4 +1,4 @@
-"""``DeviceVariation``: numbers of MuJoCo Warp's environments, changed by a mask."""
+"""``DeviceVariation``: masses, friction, gels and mountings in MuJoCo Warp by a mask."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class DeviceVariation:
         self, name: str, array: Any, which: Sequence[int] | np.ndarray | range, columns: Sequence[int] | range,
         nominal: np.ndarray, *, divides: int = 0,
     ) -> None:  # fmt: skip
-        """Let the factors ``which`` of ``name`` change columns of a contiguous array."""
+        """Let the factors ``which`` of ``name`` change columns of an array, side by side."""
         if not len(columns):
             return
         # MuJoCo Warp's vectors are float32 one after the other.
@@ -111,7 +111,7 @@ class DeviceVariation:
         self._scaled[name].append(_Scaled(self.arrays[name], of, into, start, divides, values))
 
     def launch(self, chosen: wp.array, names: Sequence[str]) -> None:
-        """Launch what ``names`` of ``arrays`` change in environments ``chosen`` (B,), bool."""
+        """Launch the changes that ``names`` of ``arrays`` make where ``chosen`` (B,), bool."""
         for name in names:
             if name == "mounting":
                 inputs = [chosen, self.arrays[name], self._carriers, self._poses, self._place, self._turn]

@@ -59,8 +59,6 @@ class PadSurfaces:
         """Reading of one pad in n environments on the nodes of ``grid``.
 
         Args:
-            name: the sensor.
-            grid: nodes of the surface.
             pad_from_body: poses (n, bodies, 4, 4).
             wrench: forces of all that touches (n, 6), as in a ``PadReading``.
             failed: environments that have failed already, (n,).

@@ -44,11 +44,8 @@ class PadTouch:
         Args:
             spec: of the sensor; ``grid``: nodes of its pad.
             bodies: parts of every body, body frame.
-            markers: model of the markers; None is no markers.
             pad: index among the pads of the world.
-            num_envs: number of environments B.
             patches: most separate contacts of the pad, for its markers.
-            device: "cpu" or "cuda".
 
         Raises ``InputError`` as ``DeviceFots``.
         """

@@ -43,7 +43,6 @@ class WorldPads(Protocol):
         """Put environments back to the start, where MuJoCo's states are.
 
         Args:
-            envs: the environments.
             bodies: not None if bodies or the robot start elsewhere: name to poses (n, 4, 4).
 
         Raises:
@@ -52,7 +51,7 @@ class WorldPads(Protocol):
         ...
 
     def advance(self, drive: Drive, failed: np.ndarray) -> None:
-        """One control step; environments that break down are marked in ``failed`` (B,) and stand."""
+        """One control step; environments that break down are in ``failed`` (B,) and stand still."""
         ...
 
     def wrench(self, name: str) -> np.ndarray:

@@ -84,8 +84,7 @@ class RigidPads:
     def reset(self, envs: Sequence[int], bodies: Mapping[str, np.ndarray] | None = None) -> None:
         """Forget what environments went through; where bodies start, the engine knows.
 
-        Raises:
-            OverlapError: a body starts beyond a pad's bonded face.
+        Raises ``OverlapError``: a body starts beyond a pad's bonded face.
         """
         pierced = self.contact.faces.pierced(self._pad_from_body()[np.asarray(envs, int)])
         for row, pad, i in np.argwhere(pierced).tolist():

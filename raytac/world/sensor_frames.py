@@ -61,8 +61,7 @@ class SensorFrames:
 
         Environments whose surface cannot be are marked in ``failed`` (B,).
 
-        Raises:
-            InputError: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
+        Raises ``InputError``: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
         """
         rows = None if envs is None else chosen_envs(envs, self._num_envs)
         if rows is not None and not rows:

@@ -122,8 +122,7 @@ class SoftPads:
         ``bodies``: not None if they or the robot start elsewhere: name to poses (n, 4, 4) of the environments named; the cases are where
         MuJoCo has them.
 
-        Raises:
-            OverlapError: bodies overlap there; the solver has not changed then, what MuJoCo shows of its bodies has.
+        Raises ``OverlapError``: bodies overlap there; the solver has not changed then, what MuJoCo shows of its bodies has.
         """
         datas = self._datas
         cases, chosen = self._pad_poses(datas), list(envs)
@@ -158,8 +157,7 @@ class SoftPads:
         An environment fails if its state is not finite, if its last step did not meet the solver's tolerance, or, with a
         ``RuntimeWarning``, if it moves too fast to be resolved near a contact.
 
-        Raises:
-            InputError: the only environment moves too fast; it has failed then, until it is reset.
+        Raises ``InputError``: the only environment moves too fast; it has failed then, until it is reset.
         """
         scene, timestep, datas = self._scene, self.composed.timestep, self._datas
         interval, since, reports = round(scene.soft_timestep / timestep), 0, []

@@ -118,8 +118,7 @@ class TactileReader:
     ) -> dict[str, TactileFrame]:
         """Frames of the sensor or sensors named (all if None), a row for each state.
 
-        Raises:
-            InputError: another number of states, states of another model, or an unknown sensor; as ``TactileSensor.update``.
+        Raises ``InputError``: another number of states, states of another model, or an unknown sensor; as ``TactileSensor.update``.
         """
         states = checked_states(self.model, self.model, datas, len(self.failed))
         self.failed[:] = [not np.isfinite(data.qpos.sum() + data.qvel.sum()) for data in states]

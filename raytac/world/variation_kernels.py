@@ -25,7 +25,7 @@ def scale_columns(
     # outputs
     values: wp.array2d(dtype=Any),
 ):
-    """Set columns (n,) of ``values`` to the nominal numbers times, or over, factors ``which``."""
+    """Set columns (n,) of ``values`` (B, …): nominal (n,) times, or over, factors ``which``."""
     i, k = wp.tid()
     if chosen[i]:
         factor = factors[i, which[k]]
@@ -43,7 +43,7 @@ def mount_pads(
     place: wp.array2d(dtype=wp.vec3),
     turn: wp.array2d(dtype=wp.quat),
 ):
-    """Poses of the bodies that carry the pads: nominal ones (pads,) times ``mounting``."""
+    """Poses of bodies (pads,) under pads: nominal ones times ``mounting`` (B, pads, 4, 4)."""
     i, k = wp.tid()
     if not chosen[i]:
         return

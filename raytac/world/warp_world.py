@@ -65,7 +65,6 @@ class WarpWorld:
 
         Args:
             scene: name of a shipped task scene, path of a scene file, or a scene.
-            num_envs: number of environments B.
             device: "auto", "cpu" or "cuda".
             frequency: of the springs in the joints [rad/s].
             launches: steps of MuJoCo in a control step, as many as the scene's if None. Of more a world divides one in which something

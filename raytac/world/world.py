@@ -404,8 +404,7 @@ class TactileWorld:
         ``envs`` (a mask (B,) or a list) gives frames with one row for each environment named. For the others no noise is drawn and no
         history is written. One that is named twice has two equal rows.
 
-        Raises:
-            InputError: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
+        Raises ``InputError``: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
         """
         return self._frames.observe(
             lambda name, grid, rows: self._pads.reading(name, grid, self._failed, rows), self._failed, sensors, envs

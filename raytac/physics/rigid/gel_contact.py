@@ -11,14 +11,13 @@ import warp as wp
 
 from raytac.errors import InputError
 from raytac.physics.rigid import world_kernels as world
-from raytac.physics.rigid.env_kernels import choose_active, clear_environments
 from raytac.physics.rigid.load_law import shear_modulus
 from raytac.physics.rigid.motion_kernels import Frames, move_bodies, pair_of_gels
 from raytac.physics.rigid.pierced import BondedFaces
 from raytac.physics.rigid.row_kernels import read_rows, set_rows, sum_wrenches
 from raytac.physics.rigid.search import PadSearch
 from raytac.physics.rigid.shear_state import ShearState
-from raytac.physics.rigid.step_kernels import approach, choose_steps
+from raytac.physics.rigid.step_kernels import approach, choose_active, choose_steps, clear_environments
 from raytac.shapes.part import Part
 from raytac.shapes.primitives import bounds
 from raytac.shapes.underside import object_radius
@@ -87,14 +86,11 @@ class GelContact:
         """Make the arrays.
 
         Args:
-            gels, bodies: of the world.
             pairs: two gels that may touch, and the search for that.
             numbers: those of ``Differences`` that environments may change, (B, …); on the CPU the arrays themselves are read in every step,
                 on CUDA ``vary`` copies them again.
-            num_envs: B.
             timestep: the scene's step [s].
             case_travel: greatest travel of a body beside a case in a step [m].
-            device: "cpu" or "cuda".
         """
         start_warp()
         self.device = wp.get_device(device)

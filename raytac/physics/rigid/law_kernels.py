@@ -24,7 +24,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 BINS = 4 * (LAW_POINTS - 1)
 """Bins of gaps: regions below so many levels are tried for the contact."""
 Sums = wp.types.vector(length=5, dtype=wp.float64)
-"""Of a bin: nodes in quarters; sums of their x, y numbers, squared distances and gaps."""
+"""Of a bin: nodes in quarters, sums of their numbers along x and y, of squares of distances from the pad's first node and of gaps."""
 _BINS = wp.constant(wp.int32(BINS))
 _SCALE = wp.constant(wp.float64(BINS))
 _POINTS = wp.constant(wp.int32(LAW_POINTS))
@@ -110,10 +110,10 @@ def clear_bins(bins: Bins, block: wp.int32, lane: wp.int32, lanes: wp.int32):
 def add_node(
     sums: wp.array(dtype=Sums), share: wp.float64, i: wp.int32, j: wp.int32, nx: wp.int32, ny: wp.int32, flat: wp.float64
 ):  # fmt: skip
-    """Add node ``i``, ``j`` of a pad's ``nx`` by ``ny`` to the bins of a block, in any order.
+    """Add node ``i``, ``j`` of a pad's ``nx`` by ``ny`` to the bins of a block; the result does not depend on the order.
 
-    ``share``: its gap at touch over the farthest that counts, in [0, 1). ``flat``: spacing along y over that along x. A node on an edge
-    of the pad stands for half a cell, one in a corner for a quarter.
+    ``share``: its gap at touch over the farthest that counts, in [0, 1). ``flat``: spacing along y over that along x. A node on an edge of
+    the pad stands for half a cell, one in a corner for a quarter.
     """
     k = wp.min(wp.int32(wp.sqrt(share) * _SCALE), _BINS - 1)
     quarters = wp.float64(4.0)

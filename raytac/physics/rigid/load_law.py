@@ -101,13 +101,9 @@ class LoadLaw:
     """
 
     def __init__(self, gap: np.ndarray, x: np.ndarray, y: np.ndarray, gelpad: GelpadSpec, deepest: float = np.inf) -> None:
-        """Law from the gap between the resting gel and the object at first touch.
-
-        Args:
-            gap: (Ny, Nx) [m], along z, >= 0, ``inf`` where there is no object.
-            x, y: evenly spaced places (Nx,) and (Ny,) in the pad frame [m].
-            deepest: greatest depth that there is gel for [m], at most the pad's thickness.
-        """
+        """``gap`` (Ny, Nx) [m]: distance along z from the resting gel to the object at first touch, >= 0, ``inf`` where there
+        is none, at evenly spaced places ``x`` (Nx,) and ``y`` (Ny,) in the pad frame [m]; ``deepest`` [m]: where there is gel for, at most
+        the pad's thickness."""
         self._gelpad = gelpad
         self.deepest = min(deepest, gelpad.thickness)
         """Greatest depth that a press may have [m]."""

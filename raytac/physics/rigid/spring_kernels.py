@@ -99,7 +99,6 @@ def normal_spring(
     """Spring of one step of a contact.
 
     Args:
-        rows, law: load law.
         depth: δ [m]; negative is a gap.
         speed: speed [m/s] at which it closes at the start of the step.
         inverse_mass: 1/m of both bodies [1/kg].

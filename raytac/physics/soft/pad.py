@@ -91,8 +91,7 @@ class SoftPad(PressPad):
     def follow(self, stage: StageSpec, steps: int = 1) -> Iterator[PadReading]:
         """Readings along one more stage, as of ``PressPad``.
 
-        Raises:
-            InputError: also for a stage deeper than any of the scene's: there the object's surface was left out.
+        Raises ``InputError``: also for a stage deeper than any of the scene's: there the object's surface was left out.
         """
         if stage.kind == "indent" and (stage.depth or self.sensor.gelpad.thickness) > self._deepest:
             rule = f"must not go deeper than the scene's deepest stage, {self._deepest * 1e3:.4g} mm (a force may go as deep as the pad)"

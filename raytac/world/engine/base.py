@@ -93,8 +93,7 @@ class Engine(Protocol):
     def prepare(self) -> None:
         """Take over models that a variation changed; once before the steps of a call.
 
-        Raises:
-            InputError: a model was changed so that pads cannot act, or contacts were lost for want of memory.
+        Raises ``InputError``: a model was changed so that pads cannot act, or contacts were lost for want of memory.
         """
         ...
 

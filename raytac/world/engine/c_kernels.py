@@ -28,7 +28,7 @@ _FITS = wp.constant(wp.float64(0.005))
 _BESIDE = wp.constant(wp.float64(1e-4))
 """Distance from a box from which a point of a gap is not on it [m]."""
 _OPEN = wp.constant(wp.float64(2e-5))
-"""Gap that a contact without friction has before and after a step [m]; what carries load is closed nearer than that."""
+"""Gap [m] of a contact without friction before and after a step; load closes it nearer."""
 _FAR = wp.constant(wp.float64(1.0))
 """Gap that no step closes [m]."""
 _SLOWEST = wp.constant(wp.float64(1e-9))
@@ -284,8 +284,10 @@ def passes(
     memory: Memory, env: wp.int32, one: wp.int32, two: wp.int32, boxes: wp.array(dtype=wp.vec3d), near: wp.vec3d, far: wp.vec3d,
     moved: wp.vec3d,
 ) -> wp.bool:  # fmt: skip
-    """True if a contact's points ``near`` and ``far`` of two boxes are not on them, or neither is on the other box once the second box
-    has moved so that the gap is closed."""
+    """True if two boxes pass each other, so that their gap is no contact once it is closed.
+
+    Its points ``near`` and ``far`` are not on the boxes, or neither is on the other box once the second one has moved.
+    """
     off = wp.max(beside_box(memory, env, one, boxes[one], near), beside_box(memory, env, two, boxes[two], far))
     by = wp.min(beside_box(memory, env, one, boxes[one], far + moved), beside_box(memory, env, two, boxes[two], near - moved))
     return wp.max(off, by) > _BESIDE
@@ -293,7 +295,7 @@ def passes(
 
 @wp.kernel
 def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(dtype=wp.int32), boxes: wp.array(dtype=wp.vec3d)):
-    """Set the reference accelerations after ``mj_referenceConstraint``: of the last rows, and of contacts of geoms that are ``hard``.
+    """Set reference accelerations of the last rows and ``hard`` geoms, after MuJoCo's own.
 
     ``boxes``: half edges of geoms that are boxes, else 0.
     """

@@ -58,7 +58,6 @@ class CMujoco:
         """Prepare the kernels.
 
         Args:
-            contact: the gels' contacts, on the CPU.
             pads: what the models call pads and what they touch.
             models: of the environments; a variation may replace one.
             datas: their states; ``bind`` names others.
@@ -118,8 +117,7 @@ class CMujoco:
     def prepare(self) -> None:
         """Take over models that were replaced.
 
-        Raises:
-            InputError: a model has another timestep than at first, or a cone in which pads cannot act.
+        Raises ``InputError``: a model has another timestep than at first, or a cone in which pads cannot act.
         """
         models = [self._models_now[b] for b in range(len(self._datas))]
         if not same_states(models, self._models):

@@ -73,7 +73,6 @@ class MujocoWarp:
         """Make the states, all at ``qpos0``.
 
         Args:
-            contact: the gels' contacts, on the device of all.
             pads: what the models call pads and what they touch.
             models: of the environments; a variation may replace one.
             timestep: of the scene's steps [s], which divide into shorter ones; None is the models'.
@@ -298,7 +297,7 @@ class MujocoWarp:
         self._launch(kernels.write_controls, values.shape, [actuators, values, self.data.ctrl])
 
     def capture(self, step: Callable[[], None]) -> Callable[[], None]:
-        """What ``step`` launches, as one graph on CUDA, else ``step``, which runs once before."""
+        """Graph of what ``step`` launches on CUDA, else ``step``; ``step`` runs once before."""
         step()
         if self.device.is_cpu:
             return step

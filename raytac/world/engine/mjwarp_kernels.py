@@ -33,7 +33,7 @@ _FITS = wp.constant(wp.float64(0.005))
 _BESIDE = wp.constant(wp.float32(1e-4))
 """Distance from a box from which a point of a gap is not on it [m]."""
 _OPEN = wp.constant(wp.float32(2e-5))
-"""Gap that a contact without friction has before and after a step [m]; what carries load is closed nearer than that."""
+"""Gap [m] of a contact without friction before and after a step; load closes it nearer."""
 _FAR = wp.constant(wp.float32(1.0))
 """Gap that no step closes [m]."""
 _SLOWEST = wp.constant(wp.float32(1e-6))
