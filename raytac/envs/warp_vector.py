@@ -1,4 +1,4 @@
-"""``WarpVectorEnv``: a task on MuJoCo Warp as a Gymnasium vector environment whose arrays are PyTorch tensors on one device."""
+"""``WarpVectorEnv``: a task on MuJoCo Warp as a Gymnasium vector of PyTorch tensors."""
 
 # pyright: reportMissingImports=false
 # (PyTorch belongs to the extra "rl", which the tests do without.)
@@ -24,7 +24,7 @@ from raytac.observe import gymnasium_space
 
 
 class WarpVectorEnv(gymnasium.vector.VectorEnv):
-    """B environments of a task, as ``TactileVectorEnv``; all arrays that it gives are tensors (B, …) on the device.
+    """B environments of a task, as ``TactileVectorEnv``, with tensors (B, …) on the device.
 
     .. code-block:: python
 
@@ -78,7 +78,7 @@ class WarpVectorEnv(gymnasium.vector.VectorEnv):
     def reset(  # type: ignore[override]
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-        """Begin episodes: of all environments, or of those in ``options["reset_mask"]`` (B,), a tensor or an array of bool.
+        """Begin episodes of all, or of those in ``options["reset_mask"]`` (B,), bool.
 
         Raises ``InputError`` for seeds of single environments, a mask of another shape, or after ``close``.
         """
@@ -94,7 +94,7 @@ class WarpVectorEnv(gymnasium.vector.VectorEnv):
     def step(  # type: ignore[override]
         self, actions: torch.Tensor | np.ndarray
     ) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Take one control step of all environments; ``actions`` (B, k) as of ``WarpBatch.step``, which raises the same.
+        """Take one control step; ``actions`` (B, k) and errors are as of ``WarpBatch.step``.
 
         Raises ``InputError`` also after ``close``.
         """
