@@ -9,10 +9,12 @@ from multiprocessing.shared_memory import SharedMemory
 from typing import Any
 
 import numpy as np
+from array_api_compat import array_namespace
 
 from raytac.checks import check_whole
 from raytac.envs.environments import TactileVectorEnv
 from raytac.envs.processes import serve
+from raytac.envs.task_rules import Array
 from raytac.observe.settings import SCALES
 
 
@@ -121,15 +123,26 @@ class FlatVector:
         """Write both observations; the history where ``begun`` holds the first one alone."""
         count = self.env.num_envs
         now = np.concatenate([observation[name].reshape(count, -1) for name in self._names], axis=1)
-        self._past[:, 1:] = self._past[:, :-1]
-        self._past[:, 0] = now
-        self._past[begun] = now[begun, None]
+        self._past = with_history(self._past, now, begun)
         actor = self._past.reshape(count, -1)
         state = self.env.batch.world.state()
         failed = state.failed[:, None]
         felt = [np.where(failed, 0.0, state.wrench[name] / SCALES["wrench"]) for name in self._sensors]
         self.buffers["actor"][:] = actor
         self.buffers["critic"][:] = np.concatenate([actor, observation["body"], *felt], axis=1)
+
+
+def with_history(past: Array, now: Array, begun: Array) -> Array:
+    """Observations (B, history, n), newest first; all the first one where an episode has begun.
+
+    Args:
+        past: the same before this step.
+        now: present observations (B, n).
+        begun: environments (B,), bool.
+    """
+    xp = array_namespace(now)
+    moved = xp.concat([now[:, None], past[:, :-1]], axis=1)
+    return xp.where(begun[:, None, None], now[:, None], moved)
 
 
 def shared_arrays(memory: SharedMemory, fields: Mapping[str, tuple[int, ...]], rows: int) -> dict[str, np.ndarray]:

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from raytac.checks import check_whole
 from raytac.envs.environments import TactileVectorEnv
-from raytac.envs.flat import FlatLayout, FlatVector, serve_flat, shared_arrays
+from raytac.envs.flat import FlatLayout, FlatVector, serve_flat, shared_arrays, with_history
 from raytac.envs.processes import Workers
 from raytac.errors import InputError
 from raytac.observe.settings import SCALES
@@ -169,7 +169,8 @@ class RslWarpEnv(VecEnv):
 
         self.batch = WarpBatch(kind.task(), num_envs=num_envs, device=device, seed=seed, **options)
         self.num_envs, self.device, self.reward_scale = num_envs, str(self.batch.device), reward_scale
-        self._history, self._past = check_whole("history", history), torch.zeros(0)
+        now = sum(int(np.prod(array.shape)) for array in self.batch.arrays.values())
+        self._past = torch.zeros(num_envs, check_whole("history", history), now, device=self.device)
         self.num_actions, self.max_episode_length = self.batch.size, self.batch.max_episode_steps
         self.control_timestep = self.batch.control_timestep
         self._scale = torch.tensor(SCALES["wrench"], dtype=torch.float64, device=self.device)
@@ -216,10 +217,7 @@ class RslWarpEnv(VecEnv):
     def _observe(self, observation: dict[str, torch.Tensor], begun: torch.Tensor) -> None:
         """Make both observations; the history where ``begun`` holds the first one alone."""
         now = torch.cat([values.reshape(self.num_envs, -1).float() for values in observation.values()], dim=1)
-        if not self._past.numel():
-            self._past = now[:, None].repeat(1, self._history, 1)
-        self._past = torch.cat([now[:, None], self._past[:, :-1]], dim=1)
-        self._past = torch.where(begun[:, None, None], now[:, None], self._past)
+        self._past = with_history(self._past, now, begun)
         actor = self._past.reshape(self.num_envs, -1)
         felt = [(wrench / self._scale).float() for wrench in self.batch.wrench.values()]
         critic = torch.cat([actor, self.batch.body_observation, *felt], dim=1)

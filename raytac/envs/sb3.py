@@ -48,7 +48,7 @@ class _DictVecEnv(VecEnv):
 
 
 class TactileVecEnv(_DictVecEnv):
-    """A ``TactileVectorEnv`` or a ``WarpVectorEnv`` as a ``VecEnv`` for ``MultiInputPolicy``.
+    """A ``TactileVectorEnv`` or ``WarpVectorEnv`` as a ``VecEnv`` for ``MultiInputPolicy``.
 
     Stable-baselines3 takes arrays of NumPy: those of a ``WarpVectorEnv`` are copied to the host in every step.
 

@@ -162,7 +162,7 @@ class WarpBatch:
 
     @property
     def steps(self) -> torch.Tensor:
-        """Steps (B,), int64, since each episode's start; writing ends episodes as much earlier."""
+        """Steps since the start of each episode (B,); writing to them ends it as much earlier."""
         return self._progress.steps
 
     @property
@@ -298,7 +298,7 @@ class WarpBatch:
             column.copy_(getattr(drawn, kind)[name])
 
     def _observe(self, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
-        """Observations, float32 and 8-bit images; touch where ``mask`` (B,), None for all."""
+        """Observations of all environments; touch of those of a mask (B,), None for all."""
         result, self.body_observation = self._progress.observation(self._gap()), self._progress.body_observation()
         if self.body_seen:
             result["body"] = self.body_observation

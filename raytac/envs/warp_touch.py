@@ -117,7 +117,7 @@ class WarpTouch:
         return result
 
     def _stacked(self, key: str, now: torch.Tensor, count: int) -> torch.Tensor:
-        """Last ``count`` observations stacked as in ``TactileObserver``; all one at the start."""
+        """The last ``count`` observations, all the present one where an episode has begun."""
         is_image = key.endswith("_rgb")
         first = now.repeat(1, 1, 1, count) if is_image else now[:, None].repeat(1, count, *(1 for _ in now.shape[1:]))
         if key not in self._last:

@@ -24,7 +24,7 @@ from raytac.observe import gymnasium_space
 
 
 class WarpVectorEnv(gymnasium.vector.VectorEnv):
-    """B environments of a task, as ``TactileVectorEnv``; arrays are tensors on the device.
+    """B environments of a task, as ``TactileVectorEnv``, with tensors (B, …) on the device.
 
     .. code-block:: python
 
@@ -78,7 +78,7 @@ class WarpVectorEnv(gymnasium.vector.VectorEnv):
     def reset(  # type: ignore[override]
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-        """Begin episodes of all environments, or of ``options["reset_mask"]`` (B,), bool.
+        """Begin episodes of all, or of those in ``options["reset_mask"]`` (B,), bool.
 
         Raises ``InputError`` for seeds of single environments, a mask of another shape, or after ``close``.
         """
@@ -94,7 +94,7 @@ class WarpVectorEnv(gymnasium.vector.VectorEnv):
     def step(  # type: ignore[override]
         self, actions: torch.Tensor | np.ndarray
     ) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Take one control step; ``actions`` (B, k) and errors as of ``WarpBatch.step``.
+        """Take one control step; ``actions`` (B, k) and errors are as of ``WarpBatch.step``.
 
         Raises ``InputError`` also after ``close``.
         """

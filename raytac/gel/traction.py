@@ -88,7 +88,7 @@ def spread_force(
     xp, count = array_namespace(indentation), indentation.shape[0]
 
     def total(values: Any) -> Any:
-        """Sums over the nodes, (B, 1, 1), row by row: a sum does not depend on the batch."""
+        """Sums over the nodes (B, 1, 1), of rows, so that they do not depend on the batch."""
         return xp.reshape(xp.sum(xp.reshape(values * area, (count, -1)), axis=1), (count, 1, 1))
 
     share = xp.where(contact, indentation.clip(0.0), 0.0)

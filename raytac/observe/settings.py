@@ -36,7 +36,7 @@ SCALES: Mapping[str, float | tuple[float, ...]] = {
     "traction": 1e4,
     "wrench": (10.0, 10.0, 10.0, 0.1, 0.1, 0.1),
 }
-"""Divisors to the order of 1: lengths [m], traction [Pa], force [N] and torque [N m]."""
+"""Divisors that bring values to the order of 1: [m], [Pa], [N] and [N m]."""
 
 
 @dataclass(frozen=True)
