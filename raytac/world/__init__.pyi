@@ -1,3 +1,4 @@
+from .engine.choice import WarpEngine as WarpEngine
 from .environment_models import Variation as Variation
 from .pad_stepper import PadStepper as PadStepper
 from .pads import WORLD_PADS as WORLD_PADS
