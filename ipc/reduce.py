@@ -96,7 +96,6 @@ class Reducer:
     """Reductions over rows of ``longest`` numbers or fewer; calls allocate nothing.
 
     Args:
-        batch: environments, B.
         longest: largest row.
     """
 

@@ -32,7 +32,6 @@ class World:
     Args:
         bodies: of unique names.
         settings: of the time step.
-        num_envs: number of environments, B.
         device: ``"cpu"``, ``"cuda"``, ``"cuda:1"`` or ``"auto"`` (CUDA if there is one).
         friction: μ by pair of body names, where it differs from ``settings.friction``.
         ignored: pairs of body names that pass through each other.
@@ -138,8 +137,7 @@ class World:
 
         On CUDA every new ``dt`` costs a recording; take few different ones.
 
-        Raises:
-            IpcError: if ``dt`` is not positive.
+        Raises ``IpcError`` if ``dt`` is not positive.
         """
         if dt is not None and not 0.0 < dt < np.inf:
             raise IpcError(f"dt = {dt}: it must be positive")
@@ -187,7 +185,6 @@ class World:
         """Positions [m] (B, n, 3) of all vertices of a soft body's mesh, or of another's surface.
 
         Args:
-            name: the body.
             frame: ``"world"``, or ``"body"`` for a bonded soft body in its own moving frame.
         """
         body = self._index(name)
@@ -282,8 +279,7 @@ class World:
 
         None where nothing touches its free nodes, as before any step. The first call for a body inverts its rest matrix.
 
-        Raises:
-            IpcError: no soft body with bonded vertices, or one too large or too ill-conditioned to be inverted.
+        Raises ``IpcError``: no soft body with bonded vertices, or one too large or too ill-conditioned to be inverted.
         """
         body = self._index(name)
         if not isinstance(self.bodies[body], SoftBody) or not self.layout.framed[body]:

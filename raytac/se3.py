@@ -20,9 +20,11 @@ _ORTHONORMAL = 1e-6
 
 
 def pose(rotation: Any, position: Any) -> Any:
-    """``target_from_source`` (…, 4, 4) from rotation matrices and positions (…, 3) [m]; arrays of NumPy or PyTorch.
+    """``target_from_source`` (…, 4, 4); arrays of NumPy or PyTorch.
 
-    Rotations (…, 3, 3), or (3, 3) of one for all positions.
+    Args:
+        rotation: matrices (…, 3, 3), or (3, 3) for all positions.
+        position: (…, 3) [m].
     """
     xp = array_namespace(rotation)
     matrix = xp.zeros((*position.shape[:-1], 4, 4), dtype=rotation.dtype, device=device(rotation))
@@ -36,16 +38,16 @@ def pose_of(position: ArrayLike, quaternion: ArrayLike) -> np.ndarray:
 
 
 def pose_error(world_from_a: np.ndarray, world_from_b: np.ndarray) -> np.ndarray:
-    """Displacement from b to a (…, 6), world axes: p_a − p_b [m] and the rotation vector log(R_a R_bᵀ) [rad], at most π long.
+    """Displacement from b to a (…, 6), world axes; poses (…, 4, 4) broadcast.
 
-    Poses (…, 4, 4) that broadcast.
+    It is p_a − p_b [m] and the rotation vector log(R_a R_bᵀ) [rad], at most π long.
     """
     turn = rotation_vector(world_from_a[..., :3, :3] @ np.swapaxes(world_from_b[..., :3, :3], -1, -2))
     return np.concatenate([world_from_a[..., :3, 3] - world_from_b[..., :3, 3], turn], axis=-1)
 
 
 def shifted_wrench(wrench: np.ndarray, arm: np.ndarray) -> np.ndarray:
-    """Wrenches (…, 6) about another point; ``arm`` (…, 3) [m] goes from that point to the one that they were about."""
+    """Wrenches (…, 6) about another point; ``arm`` (…, 3) [m] goes from it to the old one."""
     return np.concatenate([wrench[..., :3], wrench[..., 3:] + np.cross(arm, wrench[..., :3])], axis=-1)
 
 
@@ -98,10 +100,11 @@ def quaternion(r: np.ndarray) -> np.ndarray:
     return q / np.sqrt(np.square(q).sum(axis=-1, keepdims=True))
 
 
-def inverse(poses: np.ndarray) -> np.ndarray:
-    """Inverses of rigid transforms (…, 4, 4)."""
-    result = np.zeros_like(poses)
-    transposed = np.swapaxes(poses[..., :3, :3], -1, -2)
+def inverse(poses: Any) -> Any:
+    """Inverses of rigid transforms (…, 4, 4); arrays of NumPy or PyTorch."""
+    xp = array_namespace(poses)
+    result = xp.zeros_like(poses)
+    transposed = poses[..., :3, :3].mT
     result[..., :3, :3] = transposed
     result[..., :3, 3] = -(transposed @ poses[..., :3, 3, None])[..., 0]
     result[..., 3, 3] = 1.0
@@ -141,7 +144,7 @@ def nearest_rotation(matrices: np.ndarray) -> np.ndarray:
 
 
 def rotations(vectors: Any) -> Any:
-    """Rotation matrices (…, 3, 3) of rotation vectors (…, 3) [rad] (Rodrigues' formula); arrays of NumPy or PyTorch."""
+    """Rotation matrices (…, 3, 3) of vectors (…, 3) [rad] (Rodrigues), NumPy or PyTorch."""
     xp = array_namespace(vectors)
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
     angle = xp.sqrt(x * x + y * y + z * z)

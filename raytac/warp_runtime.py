@@ -12,7 +12,7 @@ from raytac.installation import foreign_ipc
 
 
 def _shared_lock() -> Any:
-    """The solver's lock of launches; where another package hides ``ipc``, there are no launches of its own."""
+    """The solver's lock of launches, or another where ``ipc`` cannot be imported."""
     if foreign_ipc() is not None:
         return RLock()
     from ipc.warp_start import LAUNCH as SHARED

@@ -21,6 +21,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "calibrate",
         "dataset/test_renderer.py",
         "envs/test_rsl_warp.py",
+        "envs/test_warp_variation.py",
         "io/test_code_digest.py",
         "markers/test_calibration.py",
         "markers/test_dots.py",
@@ -48,6 +49,8 @@ PLACES: dict[str, tuple[str, ...]] = {
     "solver": (
         "envs/test_rsl_warp.py",
         "envs/test_warp_batch.py",
+        "envs/test_warp_variation.py",
+        "envs/test_warp_vector.py",
         "ipc",
         "markers/test_other_models.py",
         "physics/rigid/test_pad_search.py",

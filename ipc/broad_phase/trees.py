@@ -165,7 +165,6 @@ class _Side:
     Args:
         kind: 1 for edges, 2 for faces.
         asks: (asking body, asked body, body pair).
-        batch: number of environments, B.
     """
 
     def __init__(self, kind: int, layout: Layout, asks: list[tuple[int, int, int]], batch: int, device: wp.Device) -> None:
@@ -219,7 +218,6 @@ class Trees:
 
     Args:
         pairs: body pairs (index, a, b) to look at; a = b for a body that touches itself. At least one.
-        batch: number of environments, B.
     """
 
     def __init__(self, layout: Layout, pairs: Sequence[tuple[int, int, int]], batch: int, device: wp.Device) -> None:

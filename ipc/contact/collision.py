@@ -25,7 +25,6 @@ class Collision:
     """Contact buffers of a batch of environments; every buffer grows when it is too small.
 
     Args:
-        batch: number of environments, B.
         d_hat: distance below which surfaces repel [m].
         margin: widening of the vertices' boxes [m].
         deterministic: sort the lists, and add up in their order.

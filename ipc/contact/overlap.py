@@ -180,7 +180,6 @@ def find_overlap(layout: Layout, x: Floats, normal: Floats, origin: Floats) -> s
     """Describe the first overlap of one environment, or None.
 
     Args:
-        layout: the flat arrays.
         x: surface vertices in the world [m] (V, 3).
         normal, origin: of the half-spaces among the bodies, world frame, (bodies, 3) and [m] (bodies, 3).
     """

@@ -37,7 +37,6 @@ def tetrahedralize(surface: TriMesh, edge_length: float, cache: Path | None = No
     """Tetrahedra of about ``edge_length`` [m] in a closed surface (fTetWild, Hu et al. 2020).
 
     Args:
-        surface: the closed surface.
         edge_length: target edge length [m].
         cache: folder of finished meshes, named by the SHA-256 of surface and target; by default under the user's cache folder. A mesh
             there that is damaged or of another surface is made again, and a folder that cannot be written is left out, with a warning.

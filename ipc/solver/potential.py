@@ -29,7 +29,6 @@ class Potential:
     """State and work space of a batch, and the launches that evaluate them.
 
     Args:
-        batch: number of environments, B.
         d_hat: [m].    kappa: [Pa].
     """
 

@@ -83,10 +83,8 @@ class StepState:
     """The decisions and flags of a batch; each type lies in one array, read in one copy.
 
     Args:
-        batch: environments, B.
         project: mask of environments whose Hessian is made definite (B,).
         halt: flag that stops everything until buffers have grown.
-        device: Warp device.
     """
 
     def __init__(self, batch: int, project: wp.array, halt: wp.array, device: wp.Device) -> None:

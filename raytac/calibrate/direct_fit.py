@@ -339,9 +339,9 @@ class DirectFit:
             for _ in range(ACTIVE):
                 fixed = damped[np.ix_(move, ~move)] @ change[~move]
                 change[move] = np.linalg.solve(damped[np.ix_(move, move)], -slope[move] - fixed)
-                wanted = self.at(x + change[:size], state.circles + change[size:].reshape(-1, 3))
-                allowed = self.inside_bounds(wanted)
-                over = move[:size] & (np.abs(self.flat(allowed) - self.flat(wanted)) > 1e-12)
+                proposed = self.at(x + change[:size], state.circles + change[size:].reshape(-1, 3))
+                allowed = self.inside_bounds(proposed)
+                over = move[:size] & (np.abs(self.flat(allowed) - self.flat(proposed)) > 1e-12)
                 if not over.any():
                     break
                 change[:size][over] = (self.flat(allowed) - x)[over]
@@ -377,9 +377,9 @@ def _draw(rho: np.ndarray, settings: FitSettings, seed: int) -> tuple[np.ndarray
     """Press, row and column of the pixels that count; ``rho`` (N, H, W): distances over radii."""
     rng, results = np.random.default_rng(seed), []
     for k, one in enumerate(rho):
-        for low, high, wanted in zip((0.0, 1.0), (1.0, settings.reach), settings.samples, strict=True):
+        for low, high, count in zip((0.0, 1.0), (1.0, settings.reach), settings.samples, strict=True):
             row, column = np.nonzero((one >= low) & (one < high))
-            chosen = np.sort(rng.permutation(len(row))[:wanted])
+            chosen = np.sort(rng.permutation(len(row))[:count])
             results.append(np.stack([np.full(len(chosen), k), row[chosen], column[chosen]]))
     press, row, column = np.concatenate(results, axis=1)
     return press, row, column

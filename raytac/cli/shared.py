@@ -113,8 +113,7 @@ def chosen_physics(physics: str | None, level: str | None, scene: PressScene | T
 
     With a level alone ``ipc``, with neither as the scene says, else ``rigid``.
 
-    Raises:
-        InputError: an unknown name, or a level of a physics that has none. SpecError: an unknown name in the scene.
+    Raises ``InputError``: an unknown name, or a level of a physics that has none. SpecError: an unknown name in the scene.
     """
     if physics is None and level is None:
         return scene_physics(None, scene)

@@ -33,8 +33,7 @@ def contact_figure(data: PressDataset, count: int = 24, columns: int = 6) -> Fig
 
     All maps have one colour scale, from 0 (what comes up counts as 0) to the greatest indentation shown.
 
-    Raises:
-        InputError: the data set has neither images nor heights, or no sound press, or a number is not whole or below 1.
+    Raises ``InputError``: the data set has neither images nor heights, or no sound press, or a number is not whole or below 1.
     """
     count, columns = check_whole("count", count), check_whole("columns", columns)
     shown = [name for name in ("rgb", "height") if name in data.description["arrays"]]

@@ -33,7 +33,6 @@ class PressDataset:
     ``verify=False`` leaves that out. Whatever the files hold, only arrays of the types and shapes that ``dataset.json`` declares are given.
 
     Attributes:
-        folder: of the data set.
         description: its ``dataset.json``.
         manifest: rows of the presses that are given, a ``pyarrow.Table``.
     """
@@ -44,7 +43,6 @@ class PressDataset:
         """Read the manifest.
 
         Args:
-            folder: of the data set.
             names: arrays of the shards, or columns of numbers of the manifest; None is all arrays.
             sensor: presses into this sensor only; must be given where the data set has several of different shapes and a stack is wanted.
             verify: compare manifest and shards with their checksums.

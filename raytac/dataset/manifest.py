@@ -63,7 +63,6 @@ def read_manifest(folder: Path, sha256: str | None = None) -> Any:
     """The manifest as a ``pyarrow.Table``; ``.to_pandas()`` where pandas is installed.
 
     Args:
-        folder: of the data set.
         sha256: hex digest that the file must have; None is any.
 
     Raises:

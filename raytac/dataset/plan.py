@@ -50,7 +50,7 @@ class Presses:
     """The object leans by ``tilt`` towards this direction, measured from +x to +y [rad], (N,)."""
     shear_x: np.ndarray
     shear_y: np.ndarray
-    """Way sideways after the indent [m], (N,)."""
+    """Displacement along x and y after the indent [m], (N,)."""
     twist: np.ndarray
     """Turn about +z after that [rad], (N,)."""
 

@@ -53,7 +53,6 @@ def render_on_ray(
 
     Args:
         job: what to render. With ``device="auto"`` a worker has a GPU if the cluster has any, else the CPU.
-        shards: their numbers.
         workers: how many; None is one a GPU, or one a node where there is none.
         address: of the cluster, ``"auto"`` for one on this machine; None starts a local Ray, unless this process has one or
             ``RAY_ADDRESS`` names one.

@@ -73,7 +73,6 @@ def render_dataset(
     shards only, and the same call goes on with the others.
 
     Args:
-        plan: what to render.
         folder: of the data set; made if need be.
         engine: one of ``ENGINES``: ``local``, in this process, or ``ray``.
         device: ``auto``, ``cpu`` or ``cuda``.
@@ -129,8 +128,7 @@ def render_dataset(
 def verify_dataset(folder: Path, *, progress: bool = False) -> Check:
     """Compare every file of a data set with its checksum; needs no plan and changes nothing.
 
-    Raises:
-        InputError: no data set, or one whose manifest differs from its checksum.
+    Raises ``InputError``: no data set, or one whose manifest differs from its checksum.
     """
     description = read_description(folder)
     manifest = Path(folder) / MANIFEST

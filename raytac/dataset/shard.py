@@ -144,7 +144,6 @@ def open_shard(
     They are if none is compressed; else they are read.
 
     Args:
-        path: of the file.
         kinds: the arrays that it must hold, by name; None: any of ``KINDS``.
         sizes: numbers that names in their shapes stand for; what is not named may be any, the same in all arrays.
         sha256: hex digest that the file must have; None is any.

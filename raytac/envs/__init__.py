@@ -1,4 +1,7 @@
-"""Gymnasium environments; importing this registers them: ``import raytac.envs; gymnasium.make("raytac/PushCube-v0")``."""
+"""Gymnasium environments; importing this registers them.
+
+``import raytac.envs; gymnasium.make("raytac/PushCube-v0")``
+"""
 
 import lazy_loader
 

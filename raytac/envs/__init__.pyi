@@ -20,6 +20,7 @@ from .push_cube import PushCube as PushCube
 from .push_cube import PushCubeEnv as PushCubeEnv
 from .push_cube import PushCubeVectorEnv as PushCubeVectorEnv
 from .registration import IDS as IDS
+from .registration import WARP_IDS as WARP_IDS
 from .registration import register_envs as register_envs
 from .roll_ball import RollBall as RollBall
 from .roll_ball import RollBallEnv as RollBallEnv
@@ -36,3 +37,4 @@ from .task_rules import TaskResult as TaskResult
 from .task_rules import TaskState as TaskState
 from .warp_batch import WarpBatch as WarpBatch
 from .warp_batch import WarpStep as WarpStep
+from .warp_vector import WarpVectorEnv as WarpVectorEnv

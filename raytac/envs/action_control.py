@@ -1,4 +1,4 @@
-"""Controllers from actions: the tool's pose, or the joints, follow a target that actions move.
+"""Controllers from actions, which move a target of the tool's pose or of the joints.
 
 Targets of many environments go through ``PoseServo``, one small solve for all of them; the viewer's sliders, one environment and people,
 go through ``DifferentialIk``, which keeps every limit (``raytac.robots.ik`` says what each costs).
@@ -25,8 +25,9 @@ from raytac.world.world import TactileWorld
 from raytac.world.world_state import BatchController
 
 ACTIONS = ("pose", "joints")
-"""``pose``: an action moves the target of the tool's pose, in the axes of the task. ``joints``: it moves the targets of the arm's seven
-joints, by up to ``Motion.joint_step`` a step, and the opening if there is one."""
+"""Actions: ``pose`` moves the target of the tool's pose, ``joints`` those of the joints.
+
+A pose's axes are the task's. The arm's seven joints move by up to ``Motion.joint_step`` a step, with the opening if there is one."""
 
 
 class ActionControl:
@@ -37,7 +38,7 @@ class ActionControl:
     """
 
     def __init__(self, world: TactileWorld, motion: Motion, action: str) -> None:
-        """Start with the targets where the tool is. Raises ``InputError`` for a scene without an arm that has motors."""
+        """Start with the targets where the tool is; InputError for no arm with motors."""
         if world.arm is None or world.arm.motors is None:
             raise InputError(
                 "scene", value=None if world.scene is None else world.scene.name, rule="needs an arm with torque motors"
@@ -68,7 +69,7 @@ class ActionControl:
 
     @property
     def target(self) -> np.ndarray:
-        """Target poses (B, 4, 4) of the tool; with ``action="joints"`` they stay where the episode began."""
+        """Target poses (B, 4, 4) of the tool; of ``action="joints"`` where the episode began."""
         return self._targets.pose.copy()
 
     def state(self) -> ToolState:
@@ -86,7 +87,7 @@ class ActionControl:
         self._joints[mask] = self._posture
 
     def controller(self, actions: np.ndarray) -> BatchController:
-        """Controller of all environments for the next control step; ``actions`` (B, size) in [−1, 1].
+        """Controller of all environments for the next step; ``actions`` (B, size) in [−1, 1].
 
         It has no targets of its own: one that was asked for before follows the same from now on.
         """

@@ -1,4 +1,4 @@
-"""Targets of tools and joints that actions move, of B environments; arrays of NumPy, or of PyTorch on any device."""
+"""Targets of tools and joints of B environments, moved by actions; NumPy or PyTorch."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ToolTargets:
     """
 
     def __init__(self, motion: Motion, tool: Array, opening: float) -> None:
-        """Start at poses (B, 4, 4) of the tool; the first one's rotation is that from which targets turn.
+        """Start at tool poses (B, 4, 4); targets turn from the first one's rotation.
 
         ``opening``: commanded at the start of an episode [m].
         """
@@ -52,7 +52,7 @@ class ToolTargets:
         self.gap = xp.where(mask, self._opening, self.gap)
 
     def move(self, actions: Array, tool: Array) -> None:
-        """Move the poses by actions (B, k), k the number of the motion's axes, where the tools are at (B, 3) now."""
+        """Move the poses by actions (B, k), k the motion's axes; tools are at (B, 3) now."""
         motion, xp = self._motion, array_namespace(actions)
         pose = xp.asarray(self.pose, copy=True)
         shift = self._step * xp.stack([actions[:, k] for k in self._columns], axis=1)
@@ -81,7 +81,6 @@ def joint_targets(motion: Motion, actions: Array, target: Array, joints: Array, 
     They move by up to the motion's ``joint_step``, lead the joints by at most its ``joint_leash`` and stay within the joints' limits.
 
     Args:
-        motion: the motion.
         actions: in [−1, 1].
         target, joints: targets before and present positions (B, n) [rad].
         limits: lower and upper one of each joint (n, 2) [rad].

@@ -1,35 +1,33 @@
-"""``TaskBatch``: B environments of one task without Gymnasium, from actions to observations, rewards and ends."""
+"""``TaskBatch``: B environments of one task without Gymnasium, from actions to rewards."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from raytac.checks import check_known, check_numbers, check_whole
+from raytac.device import resolve_device
 from raytac.envs.action_control import ACTIONS, ActionControl
-from raytac.envs.task_observation import body_from_tool, state_and_goal
-from raytac.envs.task_outcome import task_outcome
-from raytac.envs.task_rules import Task, TaskState
+from raytac.envs.task_observation import observation_arrays
+from raytac.envs.task_progress import TaskProgress
+from raytac.envs.task_rules import Task
+from raytac.envs.task_sensors import TaskSensors, sensor_seed
+from raytac.envs.variations import VariationRanges, VariationSampler, on_mounted_pad
 from raytac.errors import InputError
-from raytac.gel.surface import COARSEST_PITCH, rounded_envs
-from raytac.observe import ArraySpec, ObservationSettings, Randomization, TactileObserver, randomised_bodies
+from raytac.gel.surface import rounded_envs
+from raytac.observe import ObservationSettings, Randomization
+from raytac.optics.base import OPTICAL_OUTPUTS
 from raytac.physics.base import PhysicsConfig
-from raytac.physics.registry import checked_physics, scene_physics
+from raytac.physics.registry import checked_physics
 from raytac.robots.pose_errors import PoseErrors
-from raytac.se3 import inverse, rotations
 from raytac.specs.task import TaskScene
-from raytac.specs.task_file import load_task
-from raytac.world.environment_models import Variation
 from raytac.world.world import TactileWorld
 from raytac.world.world_state import WorldState
-
-_PITCH = 0.4e-3
-"""Spacing of the gel's nodes where no image needs a finer one [m]."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class StepResult:
     """Terms of the reward by name."""
     success: np.ndarray
     failed: np.ndarray
-    """Environments whose physics broke down: truncated, with reward 0 and their last sound observation."""
+    """Environments whose physics broke down: truncated, reward 0, last sound observation."""
 
 
 class TaskBatch:
@@ -54,7 +52,6 @@ class TaskBatch:
 
     Attributes:
         arrays: shape, type and bounds of every observation, of one environment.
-        start_tool, start_body: poses (4, 4) of the tool and of the task's body in the scene.
         time_s: seconds spent so far in ``physics``, ``observation`` and ``reward``.
     """
 
@@ -77,8 +74,6 @@ class TaskBatch:
         """Compose the world; ``reset`` begins the episodes.
 
         Args:
-            task: the task.
-            num_envs: number of environments B.
             physics, device: as of ``TactileWorld``.
             tactile: observation of every sensor: settings, or modalities alone; "task" takes those of the task; with None no sensor is
                 read and nothing of it is computed.
@@ -96,51 +91,32 @@ class TaskBatch:
         check_known("action", action, ACTIONS)
         steps = task.max_episode_steps if max_episode_steps is None else max_episode_steps
         self.task, self.num_envs, self.max_episode_steps = task, num_envs, check_whole("max_episode_steps", steps)
-        settings = task_settings(task.tactile if isinstance(tactile, str) and tactile == "task" else tactile)
-        loaded = scene if isinstance(scene, TaskScene) else load_task(task.scene if scene is None else scene)
-        self.randomization = Randomization() if randomization is None else randomization
-        # Without touch the probe gives the force alone, so that the sensor needs no markers.
-        probed = ObservationSettings(("wrench",)) if settings is None else settings
-        config = scene_physics(checked_physics(physics), loaded)
-        rigid = not config.is_simulated
-        shared = self.randomization  # drawn once for all environments
-        if rigid:
-            shared = replace(shared, youngs_modulus=0.0, friction=0.0)
-        probe = TactileObserver(loaded.robot.sensor, probed, num_envs=num_envs, randomization=shared, seed=seed)
-        loaded = replace(loaded, robot=replace(loaded.robot, sensor=probe.sensor))
-        if not rigid:
-            loaded = randomised_bodies(loaded, self.randomization, seed)
+        given = {"physics": checked_physics(physics), "scene": scene, "randomization": randomization}
+        sensors = TaskSensors.of(task, tactile, **given, num_envs=num_envs, seed=seed)
+        self.randomization = sensors.randomization
         options: dict[str, Any] = {"outputs": (), "num_envs": num_envs, "seed": seed}
-        if settings is not None:
-            options = probe.sensor_options()
-        options["pitch"] = task_pitch(probe) if pitch is None else pitch
-        self.world = TactileWorld(loaded, physics=config, device=device, **options)
-        self._variations = VariationSampler(
-            loaded, self.world.sensor_names, self.randomization, rigid=rigid, num_envs=num_envs, seed=seed
-        )
-        self.observers: dict[str, TactileObserver] = {}
-        if settings is not None:
-            per_episode = replace(
-                self.randomization, led_power=0.0, led_colour=0.0, reflectance=0.0, youngs_modulus=0.0, friction=0.0
-            )
-            for i, name in enumerate(self.world.sensor_names):
-                self.observers[name] = TactileObserver(
-                    probe.sensor, settings, num_envs=num_envs, randomization=per_episode, seed=_sensor_seed(seed, i)
-                )
+        if sensors.settings is not None:
+            options = sensors.probe.sensor_options()
+        options["pitch"] = sensors.pitch if pitch is None else pitch
+        self.world = TactileWorld(sensors.scene, physics=sensors.physics, device=device, **options)
+        if set(options["outputs"]) & set(OPTICAL_OUTPUTS) and resolve_device(device) == "cpu":
+            from raytac.optics.runtime import share_cores
+
+            share_cores()
+        names, rigid = self.world.sensor_names, not sensors.physics.is_simulated
+        ranges = VariationRanges(sensors.scene, names, sensors.randomization, rigid=rigid)
+        self._variations = VariationSampler(ranges, num_envs=num_envs, seed=seed)
+        self.observers = sensors.observers(names)
         self.control = ActionControl(self.world, task.motion, action)
         self.body_seen = task.body_seen if body_seen is None else body_seen
-        self.arrays = self._arrays()
+        size = self.control.size
+        has_grip = bool(self.control.opening_range)
+        self.arrays = observation_arrays(size, has_grip=has_grip, body_seen=self.body_seen, observers=self.observers)
         state, now = self.world.state(), self.control.state()
-        self._tool, self._opening = now.tool, now.opening
-        self.start_tool, self.start_body = self._tool[0].copy(), state.world_from_body[task.body][0].copy()
+        self._opening = now.opening
         self._start_pads = {name: poses[0].copy() for name, poses in state.world_from_pad.items()}
-        self._body = state.world_from_body[task.body]
-        self._speed, self._body_speed = np.zeros((num_envs, 3)), np.zeros((num_envs, 6))
-        self._errors = PoseErrors(num_envs, 2)
-        self._turn = np.zeros((num_envs, 3))  # of the tool from the start
-        self._goal = np.zeros((num_envs, 3))
-        self._steps = np.zeros(num_envs, int)
-        self._action = np.zeros((num_envs, self.control.size))
+        body, steps, errors = state.world_from_body[task.body], np.zeros(num_envs, int), PoseErrors(num_envs, 2)
+        self._progress = TaskProgress(task, now.tool, body, steps, actions=size, duration=self.control_timestep, errors=errors)
         self._begun = np.zeros(num_envs, bool)
         self.time_s = {"physics": 0.0, "observation": 0.0, "reward": 0.0}
 
@@ -152,29 +128,39 @@ class TaskBatch:
     # --- state, for policies that are written by hand ---------------------------------------------------------------------------
 
     @property
+    def start_tool(self) -> np.ndarray:
+        """Pose (4, 4) of the tool in the scene."""
+        return self._progress.start_tool
+
+    @property
+    def start_body(self) -> np.ndarray:
+        """Pose (4, 4) of the task's body in the scene."""
+        return self._progress.start_body
+
+    @property
     def tool(self) -> np.ndarray:
-        """Poses (B, 4, 4) of the tool after the last step; an environment that failed keeps its last one."""
-        return self._tool.copy()
+        """Poses (B, 4, 4) of the tool after the last step; a failed environment keeps its last."""
+        return self._progress.tool.copy()
 
     @property
     def body(self) -> np.ndarray:
         """Poses (B, 4, 4) of the task's body after the last step."""
-        return self._body.copy()
+        return self._progress.body.copy()
 
     @property
     def body_speed(self) -> np.ndarray:
         """Mean velocity [m/s] and angular velocity [rad/s] of the body over the last step, (B, 6)."""
-        return self._body_speed.copy()
+        return self._progress.body_speed.copy()
 
     @property
     def goal(self) -> np.ndarray:
         """Goal positions (B, 3) [m]."""
-        return self._goal.copy()
+        return self._progress.goal.copy()
 
     @property
     def action(self) -> np.ndarray:
         """Last actions (B, k); 0 after a reset."""
-        return self._action.copy()
+        return self._progress.action.copy()
 
     @property
     def target(self) -> np.ndarray:
@@ -184,38 +170,32 @@ class TaskBatch:
     # --- episodes --------------------------------------------------------------------------------------------------------------
 
     def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
-        """Seed the random streams of cameras, markers, bodies and mounts; the next ``reset`` draws from them."""
+        """Seed the streams of cameras, markers, bodies and mounts for the next ``reset``."""
         self._variations.reseed(envs, seeds)
         for i, (name, observer) in enumerate(self.observers.items()):
-            sensor_seeds = [_sensor_seed(seed, i) for seed in seeds]
+            sensor_seeds = [sensor_seed(seed, i) for seed in seeds]
             observer.reseed(envs, sensor_seeds)
             if observer.settings.needs_markers:
                 self.world.sensors[name].marker_tracker.reseed(envs, sensor_seeds)
 
     def reset(self, envs: Sequence[int], rngs: Sequence[np.random.Generator]) -> dict[str, np.ndarray]:
-        """Begin episodes in environments, each with its own generator; returns the observation (B, …) of all environments."""
+        """Begin episodes in ``envs``, each with its generator; returns all observations (B, …)."""
         envs = list(envs)
         u = np.array([rng.random(self.task.draws) for _, rng in zip(envs, rngs, strict=True)]).reshape(len(envs), self.task.draws)
         starts = self.task.starts(u, self.start_tool, self.start_body)
-        bodies = dict(starts.bodies)
-        variation = None if self._variations.is_none else self._variations.draw(envs)
-        if variation is not None and self.task.stands_on is not None and self.task.stands_on in variation.mounting:
-            # A body that stands on the pad keeps its pose relative to the pad, so it is shifted and tilted with the pad's mounting.
-            nominal = self._start_pads[self.task.stands_on]
-            shift = nominal @ variation.mounting[self.task.stands_on] @ inverse(nominal)
-            bodies[self.task.body] = shift @ bodies[self.task.body]
+        bodies, pad = dict(starts.bodies), self.task.stands_on
+        variation = None if self._variations.ranges.is_none else self._variations.draw(envs)
+        if variation is not None and pad is not None and pad in variation.mounting:
+            bodies = on_mounted_pad(self.task.body, bodies, self._start_pads[pad], variation.mounting[pad])
         state = self.world.reset(envs, bodies=bodies, variation=variation)
-        self._goal[envs] = starts.goal
-        self._steps[envs], self._action[envs], self._begun[envs] = 0, 0.0, True
+        self._begun[envs] = True
         self.control.reset(envs)
         for observer in self.observers.values():
             observer.reset(envs)
-        now = self.control.state()
-        self._opening = now.opening
-        self._tool[envs], self._body[envs] = now.tool[envs], state.world_from_body[self.task.body][envs]
-        self._speed[envs], self._body_speed[envs] = 0.0, 0.0
-        self._turn = self._errors((self._tool, self.start_tool))[0, :, 3:]
-        return self._observe(np.isin(np.arange(self.num_envs), envs), state)
+        now, goal, mask = self.control.state(), self._progress.goal.copy(), np.isin(np.arange(self.num_envs), envs)
+        self._opening, goal[envs] = now.opening, starts.goal
+        self._progress.begin(mask, now.tool, state.world_from_body[self.task.body], goal)
+        return self._observe(mask, state)
 
     def step(self, actions: np.ndarray, unseen: np.ndarray | None = None) -> StepResult:
         """One control step of every environment.
@@ -237,55 +217,29 @@ class TaskBatch:
         tool, joint_speed, opening, self._opening = now.tool, now.speed, self._opening, now.opening
         if failed.any():
             # An environment that failed keeps its last poses and opening.
-            tool[failed], body[failed], joint_speed[failed] = self._tool[failed], self._body[failed], 0.0
+            tool[failed], body[failed], joint_speed[failed] = self.tool[failed], self.body[failed], 0.0
             self._opening[failed] = opening[failed]
             wrench = {name: np.nan_to_num(values) for name, values in wrench.items()}
-        dt = self.control_timestep
-        moved, turned = self._errors((body, self._body), (tool, self.start_tool))
-        self._speed, self._body_speed, self._turn = (tool[:, :3, 3] - self._tool[:, :3, 3]) / dt, moved / dt, turned[:, 3:]
-        self._tool, self._body = tool, body
-        last, self._action = self._action, actions
-        self._steps += 1
-        task_state = TaskState(
-            tool=self._tool,
-            speed=self._speed,
-            body=self._body,
-            body_speed=self._body_speed,
-            goal=self._goal,
-            wrench=wrench,
-            opening=self._opening,
-            joint_speed=joint_speed,
-            action=actions,
-            last_action=last,
-        )
+        self._progress.advance(tool, body, actions)
         judged = time.perf_counter()
         observation = self._observe(np.ones(self.num_envs, bool) if unseen is None else ~unseen, state)
         failed = self.world.failed  # includes failures that only the pad's surface shows
         self.time_s["observation"] += time.perf_counter() - judged
         judged = time.perf_counter()
-        end = task_outcome(self.task, task_state, self._steps, self.max_episode_steps, failed)
+        end = self._progress.outcome(wrench, self._opening, joint_speed, failed, self.max_episode_steps)
         self.time_s["reward"] += time.perf_counter() - judged
         return StepResult(observation, end.reward, end.terminated, end.truncated, end.terms, end.success, failed)
 
     # --- observations ----------------------------------------------------------------------------------------------------------
 
-    def _arrays(self) -> dict[str, ArraySpec]:
-        sizes = {"state": 9 + len(self.control.opening_range) // 2 + self.control.size, "goal": 3}
-        if self.body_seen:
-            sizes["body"] = 15
-        specs = {name: ArraySpec((n,), np.float32, -np.inf, np.inf) for name, n in sizes.items()}
-        for name, observer in self.observers.items():
-            specs |= {f"{name}_{modality}": spec for modality, spec in observer.arrays.items()}
-        return specs
-
     def _observe(self, which: np.ndarray, state: WorldState) -> dict[str, np.ndarray]:
-        """Observations of all environments; sensors are read in those of ``which`` (B,), the others keep their last reading.
+        """Observations of all environments; sensors are read in those of ``which`` (B,).
 
-        ``state``: present state of the world.
+        The others keep their last reading. ``state``: present state of the world.
         """
-        result = state_and_goal(self._tool, self.start_tool, self._turn, self._speed, self._opening, self._action, self._goal)
+        result = self._progress.observation(self._opening)
         if self.body_seen:
-            result["body"] = body_from_tool(self._tool, self._body, self._body_speed)
+            result["body"] = self._progress.body_observation()
         rows = None if which.all() else rounded_envs(np.flatnonzero(which).tolist(), self.num_envs)
         needs_frames = any(observer.settings.needs_frames for observer in self.observers.values())
         frames = self.world.observe(envs=rows) if needs_frames and which.any() else {}
@@ -309,86 +263,3 @@ class TaskBatch:
             env = int(np.flatnonzero(~self._begun)[0])
             raise InputError("environment", value=env, rule="must be reset before it is stepped")
         return np.minimum(np.maximum(values, -1.0), 1.0)
-
-
-def _sensor_seed(seed: int, sensor: int) -> int:
-    """Seed of a sensor of an environment; never that of a neighbouring environment, whose seed is the next number."""
-    return seed + (sensor << 64)
-
-
-def task_pitch(observer: TactileObserver) -> float:
-    """Pitch [m] as fine as the images, if there are any, between the coarsest allowed one and ``_PITCH``."""
-    if "rgb" not in observer.settings.modalities:
-        return _PITCH
-    return max(COARSEST_PITCH, min(_PITCH, *observer.sensor.camera.pitch_at(observer.layout.rendered)))
-
-
-def task_settings(tactile: ObservationSettings | Sequence[str] | str | None) -> ObservationSettings | None:
-    if tactile is None or isinstance(tactile, ObservationSettings):
-        return tactile
-    return ObservationSettings((tactile,) if isinstance(tactile, str) else tuple(tactile))
-
-
-class VariationSampler:
-    """Seeded variations of B environments, from one random stream an environment: its draws do not depend on B."""
-
-    def __init__(
-        self,
-        scene: TaskScene,
-        sensors: Sequence[str],
-        randomization: Randomization,
-        *,
-        rigid: bool,
-        num_envs: int = 1,
-        seed: int = 0,
-    ) -> None:
-        """Seed the streams; draw nothing yet.
-
-        Args:
-            scene: scene whose bodies vary.
-            sensors: names of the sensors whose mounting varies.
-            randomization: half widths; ``body_mass``, ``body_friction``, ``youngs_modulus``, ``friction``, ``pad_shift`` and ``pad_turn``
-                of it are used.
-            rigid: pads are rigid. Soft pads and the bodies among them are the same in all environments, so that only their mounting is
-                drawn.
-            num_envs: number of environments B.
-            seed: environment b begins with seed + b.
-        """
-        self._randomization, self._sensors = randomization, tuple(sensors)
-        self._bodies_differ, self._gels_differ = rigid and randomization.changes_bodies, rigid and randomization.changes_gel
-        self._masses = [body.name for body in scene.bodies if body.dynamics == "free"]
-        self._frictions = [body.name for body in scene.bodies]
-        self.is_none = not (self._bodies_differ or self._gels_differ or randomization.changes_mounting)
-        """True if nothing varies."""
-        self._streams = [_stream(seed + b) for b in range(num_envs)]
-
-    def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
-        """Seed the streams of environments."""
-        for b, seed in zip(envs, seeds, strict=True):
-            self._streams[b] = _stream(seed)
-
-    def draw(self, envs: Sequence[int]) -> Variation:
-        """Draw a variation of the environments named, one row each."""
-        r = self._randomization
-        # The number and order of draws does not depend on the widths, so that a width of 0 changes nothing else.
-        count = len(self._masses) + len(self._frictions) + 8 * len(self._sensors)
-        u = np.array([self._streams[b].uniform(-1.0, 1.0, count) for b in envs]).reshape(len(envs), count)
-        mass, friction, mounting = np.split(u, np.cumsum([len(self._masses), len(self._frictions)]), axis=1)
-        poses = np.repeat(np.eye(4)[None], len(envs) * len(self._sensors), axis=0).reshape(len(envs), -1, 4, 4)
-        mounting, gel = np.split(mounting.reshape(len(envs), -1, 8), [6], axis=2)
-        poses[..., :3, 3] = r.pad_shift * mounting[..., :3]
-        poses[..., :3, :3] = rotations(r.pad_turn * mounting[..., 3:])
-        factors: dict[str, dict[str, np.ndarray]] = {}
-        if self._bodies_differ:
-            factors["mass"] = {name: 1.0 + r.body_mass * mass[:, i] for i, name in enumerate(self._masses)}
-            factors["friction"] = {name: 1.0 + r.body_friction * friction[:, i] for i, name in enumerate(self._frictions)}
-        if self._gels_differ:
-            factors["gel_stiffness"] = {name: 1.0 + r.youngs_modulus * gel[:, i, 0] for i, name in enumerate(self._sensors)}
-            factors["gel_friction"] = {name: 1.0 + r.friction * gel[:, i, 1] for i, name in enumerate(self._sensors)}
-        if r.changes_mounting:
-            factors["mounting"] = {name: poses[:, i] for i, name in enumerate(self._sensors)}
-        return Variation(**factors)
-
-
-def _stream(seed: int) -> np.random.Generator:
-    return np.random.default_rng((seed, 0xB0D1))

@@ -1,4 +1,4 @@
-"""Gymnasium environments over ``TaskBatch``: single ones, vectors that are stepped as one batch, and their pictures."""
+"""Gymnasium environments over ``TaskBatch``: single ones, vectors, and their pictures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ _RENDER_MODES = ("rgb_array",)
 _GAIN = 4.0
 """Length of a drawn arrow over the marker's displacement."""
 _PAPER, _INK, _DOT = (250, 250, 250), (43, 108, 176), (120, 120, 120)
-_MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED)
 
 
 class _Task:
@@ -34,7 +33,7 @@ class _Task:
     closed = False
 
     def _compose(self, num_envs: int, render_mode: str | None, options: dict[str, Any]) -> None:
-        """Check the mode and compose the world of ``TaskBatch``. Raises ``InputError`` for an unknown mode; as ``TaskBatch``."""
+        """Compose the world of ``TaskBatch``; InputError for an unknown mode; raises as it."""
         if render_mode is not None and render_mode not in _RENDER_MODES:
             raise InputError("render_mode", value=render_mode, rule="must be None or a known mode", choices=_RENDER_MODES)
         self.render_mode = render_mode
@@ -78,15 +77,16 @@ class TactileEnv(_Task, gymnasium.Env):
     """
 
     def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
-        """Compose the world. ``render_mode`` is None or ``rgb_array``, else an ``InputError``; raises as ``TaskBatch``."""
+        """Compose the world of ``TaskBatch``, raising as it; ``render_mode``: None or ``rgb_array``."""
         self._compose(1, render_mode, options)
         self.observation_space, self.action_space = self._spaces()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Begin an episode; a seed makes this and all later ones repeatable, with the sensors' noise. ``options`` are ignored.
+        """Begin an episode; a seed makes this and later ones repeatable, noise included.
 
+        ``options`` are ignored.
         Raises ``InputError`` after ``close``.
         """
         self._check_open()
@@ -112,7 +112,7 @@ class TactileEnv(_Task, gymnasium.Env):
         return _row(out.observation), float(out.reward[0]), bool(out.terminated[0]), bool(out.truncated[0]), info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
-        """8-bit picture (H, W, 3) of the scene, the goal in green, and of the sensors beside it; None without a render mode.
+        """8-bit picture (H, W, 3) of scene, green goal and sensors; None without a render mode.
 
         Raises:
             InputError: before the first ``reset``.
@@ -128,12 +128,12 @@ class TactileEnv(_Task, gymnasium.Env):
 
 
 class TactileVectorEnv(_Task, gymnasium.vector.VectorEnv):
-    """B environments of a task in one world: stepped together, and read by each sensor in one call.
+    """B environments of a task in one world, stepped together and sensed in one call.
 
     Subclasses name the task. Keyword arguments are those of ``TaskBatch``. ``infos`` hold arrays (B,): ``reward_terms`` (name to array),
-    ``success``, ``failed``; environments that are reset in the same step also have ``final_obs`` and ``final_info`` (arrays of objects), as
-    in Gymnasium's own vectors. Environment b is seeded with seed + b and behaves as the single environment of that seed, noise of cameras
-    and markers included.
+    ``success``, ``failed``; environments that are reset in the same step also have ``final_obs`` and ``final_info`` (arrays of objects),
+    as in Gymnasium's own vectors. Environment b is seeded with seed + b and behaves as the single environment of that seed, noise of
+    cameras and markers included.
     """
 
     def __init__(
@@ -156,11 +156,7 @@ class TactileVectorEnv(_Task, gymnasium.vector.VectorEnv):
         Raises:
             InputError: a value out of its choices.
         """
-        try:
-            self._mode = AutoresetMode(autoreset_mode)
-        except ValueError as error:
-            choices = [mode.value for mode in _MODES]
-            raise InputError("autoreset_mode", value=autoreset_mode, rule="must be a known mode", choices=choices) from error
+        self._mode = checked_mode(autoreset_mode)
         self._compose(num_envs, render_mode, options)
         self.num_envs = num_envs
         self.single_observation_space, self.single_action_space = self._spaces()
@@ -175,8 +171,7 @@ class TactileVectorEnv(_Task, gymnasium.vector.VectorEnv):
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Begin episodes: of all environments, or of those in ``options["reset_mask"]`` (B,).
 
-        Raises:
-            InputError: seeds of another number than environments, a mask of another shape, or after ``close``.
+        Raises ``InputError``: seeds of another number than environments, a mask of another shape, or after ``close``.
         """
         self._check_open()
         mask = (options or {}).get("reset_mask")
@@ -194,7 +189,7 @@ class TactileVectorEnv(_Task, gymnasium.vector.VectorEnv):
         return self._observation, {}
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Take one control step of all environments; the action of one that is reset in this step is ignored, whatever it holds.
+        """Take one control step; actions of environments that are reset in it are ignored.
 
         Raises ``InputError`` for actions of another shape, outside of [−1, 1] or not finite, naming the environment; or after ``close``.
         """
@@ -222,7 +217,7 @@ class TactileVectorEnv(_Task, gymnasium.vector.VectorEnv):
         return observation, reward, terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # type: ignore[override]
-        """One picture of each environment, as ``TactileEnv.render``; None without a render mode. Raises the same."""
+        """A picture of each environment, as ``TactileEnv.render``; None without a render mode."""
         return self._pictures()
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -241,6 +236,15 @@ class TactileVectorEnv(_Task, gymnasium.vector.VectorEnv):
         final = {"reward_terms": terms, "success": out.success & has_ended, "failed": out.failed & has_ended}
         info = _infos(self.num_envs, final)
         return {"final_obs": last, "_final_obs": has_ended, "final_info": info, "_final_info": has_ended.copy()}
+
+
+def checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
+    """``AutoresetMode`` of a name; ``InputError`` with the choices for one that there is not."""
+    try:
+        return AutoresetMode(mode)
+    except ValueError as error:
+        choices = [mode.value for mode in AutoresetMode]
+        raise InputError("autoreset_mode", value=mode, rule="must be a known mode", choices=choices) from error
 
 
 def serve_vector(pipe: Connection, kind: type[TactileVectorEnv], num_envs: int, options: dict[str, Any]) -> None:
@@ -276,7 +280,7 @@ class EnvironmentPicture:
         )
 
     def draw(self, env: int, observation: Mapping[str, np.ndarray]) -> np.ndarray:
-        """8-bit picture (H, W, 3) of an environment, the goal in green; ``observation`` (B, …) is the batch's last one."""
+        """8-bit picture (H, W, 3) of an environment with the goal; ``observation``: last (B, …)."""
         columns = [self._camera.draw(env, [self._batch.goal[env]])]
         for name in self._batch.observers:
             panels = []
@@ -338,7 +342,7 @@ def _row(observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _infos(num_envs: int, values: dict[str, Any]) -> dict[str, Any]:
-    """Entries with the masks that Gymnasium's vectors put beside them: the environments that have the entry."""
+    """Entries with the masks of Gymnasium's vectors: the environments that have an entry."""
     result: dict[str, Any] = {}
     everywhere = np.ones(num_envs, bool)
     for name, value in values.items():

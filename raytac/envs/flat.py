@@ -1,4 +1,4 @@
-"""Vectors of environments with two flat observations: what a policy is given, and what its critic is given in training (asymmetric)."""
+"""Vectors with two flat observations: the policy's, and its critic's in training."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class FlatLayout:
 
 
 class FlatVector:
-    """A ``TactileVectorEnv`` whose observations are vectors: ``actor`` (B, n) and ``critic`` (B, m).
+    """``TactileVectorEnv`` with observations ``actor`` (B, n) and ``critic`` (B, m).
 
     The actor is given all that the task observes, one after the other, of the last ``history`` steps, newest first. The critic is given
-    that and, whether the task shows them or not, pose and velocity of the body and the wrench of every sensor. Environments begin again in
-    the step in which they end.
+    that and, whether the task shows them or not, pose and velocity of the body and the wrench of every sensor. Environments begin again
+    in the step in which they end.
 
     Attributes:
         layout: names and shapes.
@@ -56,7 +56,6 @@ class FlatVector:
 
         Args:
             kind: the task's vector, such as ``PushCubeVectorEnv``.
-            num_envs: number of environments B.
             history: number of steps whose observations the actor is given.
             hidden: modalities that neither is given, though ``tactile`` names them: for pictures.
             seed: of environment 0; environment b has seed + b.
@@ -95,7 +94,7 @@ class FlatVector:
         self.buffers = dict(buffers)
 
     def reset(self, seed: int | None = None) -> None:
-        """Begin all episodes, environment b with seed + b; None goes on with the present random streams."""
+        """Begin all episodes, environment b with seed + b; None goes on with the streams."""
         count = self.env.num_envs
         observation, _ = self.env.reset(seed=None if seed is None else [seed + b for b in range(count)])
         for name in ("age", "reward", "terminated", "truncated", "success", "failed", "terms"):
@@ -103,7 +102,7 @@ class FlatVector:
         self._observe(observation, np.ones(count, bool))
 
     def step(self) -> None:
-        """Take a step with ``buffers["action"]``, cut to [−1, 1]. Raises ``InputError`` for actions that are not finite."""
+        """Step with ``buffers["action"]``, cut to [−1, 1]; InputError if not finite."""
         out = self.buffers
         observation, reward, terminated, truncated, infos = self.env.step(np.clip(out["action"], -1.0, 1.0))
         out["age"] += 1.0
@@ -119,7 +118,7 @@ class FlatVector:
         self._observe(observation, ended | early)
 
     def _observe(self, observation: dict[str, np.ndarray], begun: np.ndarray) -> None:
-        """Write both observations; the history of environments that have ``begun`` holds their first one alone."""
+        """Write both observations; the history where ``begun`` holds the first one alone."""
         count = self.env.num_envs
         now = np.concatenate([observation[name].reshape(count, -1) for name in self._names], axis=1)
         self._past[:, 1:] = self._past[:, :-1]
@@ -143,8 +142,9 @@ def shared_arrays(memory: SharedMemory, fields: Mapping[str, tuple[int, ...]], r
 
 
 def serve_flat(pipe: Connection, kind: type[TactileVectorEnv], num_envs: int, options: dict[str, Any]) -> None:
-    """Serve a ``FlatVector`` whose arrays are rows of shared memory; no learner's library is imported.
+    """Serve a ``FlatVector`` whose arrays are rows of shared memory, without a learner.
 
+    No learner's library is imported.
     The first reply is its ``FlatLayout``. Commands: ``("attach", (name of the memory, first row, number of rows))``, ``("reset", seed)``
     and ``("step", None)``.
     """

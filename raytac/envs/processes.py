@@ -1,4 +1,4 @@
-"""Vectors of environments in processes of their own, each with a world: physics of a world runs on one core."""
+"""Vectors of environments in processes, each with a world on one core."""
 
 from __future__ import annotations
 
@@ -32,7 +32,9 @@ def one_thread() -> Iterator[None]:
 
 
 class Workers:
-    """Processes that each make one vector and reply to commands. Ctrl-C reaches the caller alone, and workers end with it.
+    """Processes that each make one vector and reply to commands.
+
+    Ctrl-C reaches the caller alone, and workers end with it.
 
     Attributes:
         each: number of environments of a process.
@@ -48,7 +50,6 @@ class Workers:
             serve: function that a process runs, with (pipe, kind, number of environments, options); see ``serve_vector``.
             kind: what makes a vector.
             num_envs: number of environments in all, the same number in each process.
-            processes: number of processes.
             seed: of process 0; process k has seed + k num_envs / processes, so that no two environments have the same random stream.
             options: of ``kind``; they must pickle.
 
@@ -80,7 +81,7 @@ class Workers:
             pipe.send((command, value))
 
     def replies(self) -> list[Any]:
-        """One reply of every process. All are read before an error is raised, so that none is mistaken for a later one."""
+        """One reply of every process, all read before an error is raised, so none is left over."""
         replies = []
         for k, (worker, pipe) in enumerate(self._workers):
             try:

@@ -20,15 +20,22 @@ _MODULES: Final = {
     "OpenDrawer": "open_drawer",
 }
 _VERSIONS: Final = {"PushCube": 0, "BalancePole": 1, "LiftCube": 2, "RollBall": 1, "InsertPeg": 0, "OpenDrawer": 0}
-"""A task has one version, which its docstring tells the history of; Gymnasium names it to who asks for an older one."""
+"""Version of each task, named by Gymnasium to who asks for an older one; see its docstring."""
+TASKS: Final = tuple(_VERSIONS)
+"""Names of the tasks."""
 _NAMES: Final = {name: f"raytac/{name}-v{version}" for name, version in _VERSIONS.items()}
 IDS: Final = tuple(_NAMES.values())
-"""Names that ``gymnasium.make`` and ``gymnasium.make_vec`` take once ``raytac.envs`` is imported."""
+"""Names for ``gymnasium.make`` and ``make_vec`` once ``raytac.envs`` is imported."""
+_WARP_NAMES: Final = {name: f"raytac/{name}Warp-v{version}" for name, version in _VERSIONS.items()}
+WARP_IDS: Final = tuple(_WARP_NAMES.values())
+"""Names for ``gymnasium.make_vec`` of the same tasks on MuJoCo Warp, with PyTorch tensors."""
 
 
 def register_envs() -> None:
-    """Register all, each as one environment and as a vector. Episodes end by themselves, so there is no time limit around them."""
+    """Register all, alone, as a vector and as one of tensors, without a time limit around it."""
     for name, module in _MODULES.items():
         if _NAMES[name] not in gymnasium.registry:
             where = f"raytac.envs.{module}:{name}"
             gymnasium.register(_NAMES[name], entry_point=f"{where}Env", vector_entry_point=f"{where}VectorEnv")
+            vector = "raytac.envs.warp_vector:WarpVectorEnv"
+            gymnasium.register(_WARP_NAMES[name], vector_entry_point=vector, kwargs={"task": name})

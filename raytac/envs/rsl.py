@@ -1,4 +1,4 @@
-"""Environments for rsl_rl: vectors of ours, in this process or in several, as its ``VecEnv``."""
+"""Environments for rsl_rl: our vectors as its ``VecEnv``, in one process or several."""
 
 # pyright: reportMissingImports=false
 # (rsl_rl and PyTorch belong to the extra "rl", which the tests do without.)
@@ -22,10 +22,10 @@ from raytac.observe.settings import SCALES
 
 
 class RslVecEnv(VecEnv):
-    """Environments of one task with the observation groups ``actor`` and ``critic`` of ``FlatVector``.
+    """Environments of one task with ``FlatVector``'s groups ``actor`` and ``critic``.
 
-    ``extras`` of a step hold ``time_outs`` (an end by broken physics is none: no return is to be expected from beyond it), ``success`` and
-    ``failed``, each (B,), and in ``log`` the mean of every term of the reward.
+    ``extras`` of a step hold ``time_outs`` (an end by broken physics is none: no return is to be expected from beyond it), ``success``
+    and ``failed``, each (B,), and in ``log`` the mean of every term of the reward.
     """
 
     def __init__(
@@ -43,10 +43,8 @@ class RslVecEnv(VecEnv):
 
         Args:
             kind: the task's vector, such as ``PushCubeVectorEnv``.
-            num_envs: number of environments in all.
             processes: processes that these are spread over, each with a world of its own; 0 is this process.
             device: of the tensors; that of the worlds is among ``options``, as ``world_device``.
-            reward_scale: factor of the reward.
             seed: of environment 0; environment b has seed + b.
             options: ``history`` of ``FlatVector``, and those of ``TaskBatch``.
 
@@ -74,7 +72,7 @@ class RslVecEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:  # type: ignore[override]
-        """Steps (B,) since the start of each episode. Setting them ends the episodes as much earlier."""
+        """Steps (B,) since each episode's start; setting them ends episodes as much earlier."""
         return self._tensor("age").long()
 
     @episode_length_buf.setter
@@ -82,7 +80,7 @@ class RslVecEnv(VecEnv):
         self._arrays["age"][:] = steps.cpu().numpy()
 
     def reset(self, seed: int | None = None) -> TensorDict:
-        """Begin all episodes, environment b with seed + b; None goes on with the present random streams."""
+        """Begin all episodes, environment b with seed + b; None goes on with the streams."""
         if self._workers is None:
             assert self._vector is not None
             self._vector.reset(seed)
@@ -98,8 +96,7 @@ class RslVecEnv(VecEnv):
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
         """Step all environments with actions (B, k), cut to [−1, 1]; those that end begin again.
 
-        Raises:
-            InputError: actions that are not finite; the message names the environment.
+        Raises ``InputError``: actions that are not finite; the message names the environment.
         """
         values = actions.detach().cpu().numpy()
         if not np.isfinite(values).all():
@@ -141,8 +138,9 @@ class RslVecEnv(VecEnv):
 
 
 class RslWarpEnv(VecEnv):
-    """Environments of one task on MuJoCo Warp, with the observation groups of ``RslVecEnv``; nothing is copied to the host.
+    """Environments of one task on MuJoCo Warp, with ``RslVecEnv``'s observation groups.
 
+    Nothing is copied to the host.
     ``extras`` are those of ``RslVecEnv``, with tensors in ``log``.
     """
 
@@ -163,7 +161,6 @@ class RslWarpEnv(VecEnv):
             kind: the task's vector, such as ``PushCubeVectorEnv``.
             num_envs, device, seed: as of ``WarpBatch``.
             history: number of steps whose observations the actor is given.
-            reward_scale: factor of the reward.
             options: of ``WarpBatch``; ``body_seen`` is whether the actor sees the body.
 
         Raises ``InputError`` as ``WarpBatch``.
@@ -181,7 +178,7 @@ class RslWarpEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:  # type: ignore[override]
-        """Steps (B,) since the start of each episode. Setting them ends the episodes as much earlier."""
+        """Steps (B,) since each episode's start; setting them ends episodes as much earlier."""
         return self.batch.steps.clone()
 
     @episode_length_buf.setter
@@ -217,7 +214,7 @@ class RslWarpEnv(VecEnv):
         self.batch.check()
 
     def _observe(self, observation: dict[str, torch.Tensor], begun: torch.Tensor) -> None:
-        """Make both observations; the history of environments that have ``begun`` holds their first one alone."""
+        """Make both observations; the history where ``begun`` holds the first one alone."""
         now = torch.cat([values.reshape(self.num_envs, -1).float() for values in observation.values()], dim=1)
         if not self._past.numel():
             self._past = now[:, None].repeat(1, self._history, 1)

@@ -1,4 +1,4 @@
-"""Environments for stable-baselines3: a vector of ours as its ``VecEnv``, and several of them in processes."""
+"""Environments for stable-baselines3: our vectors as its ``VecEnv``, also in processes."""
 
 # pyright: reportMissingImports=false
 # (stable-baselines3 and PyTorch belong to the extra "rl", which the tests do without.)
@@ -9,11 +9,13 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
 from raytac.envs.environments import TactileVectorEnv, serve_vector
 from raytac.envs.processes import Workers
+from raytac.envs.warp_vector import WarpVectorEnv
 from raytac.errors import InputError
 
 Observations = dict[str, np.ndarray]
@@ -46,15 +48,17 @@ class _DictVecEnv(VecEnv):
 
 
 class TactileVecEnv(_DictVecEnv):
-    """A ``TactileVectorEnv`` as a ``VecEnv``: dictionary observations, for ``MultiInputPolicy``.
+    """A ``TactileVectorEnv`` or a ``WarpVectorEnv`` as a ``VecEnv``: dictionary observations, for ``MultiInputPolicy``.
+
+    Stable-baselines3 takes arrays of NumPy: those of a ``WarpVectorEnv`` are copied to the host in every step.
 
     ``infos`` hold ``success``, ``failed``, ``TimeLimit.truncated``, and ``terminal_observation`` of episodes that have ended. One that
     ended because its physics broke down is not ``TimeLimit.truncated``: a learner must not expect a return from beyond it.
-    ``seed(s)`` before ``reset`` seeds environment b with s + b.
+    ``seed(s)`` before ``reset`` seeds environment b with s + b, and a ``WarpVectorEnv`` with s.
     """
 
-    def __init__(self, env: TactileVectorEnv) -> None:
-        """Wrap ``env``. Raises ``InputError`` for a vector that does not reset environments in the step in which they end."""
+    def __init__(self, env: TactileVectorEnv | WarpVectorEnv) -> None:
+        """Wrap ``env``; InputError unless it resets environments in the step that ends them."""
         mode = env.metadata["autoreset_mode"]
         if mode is not AutoresetMode.SAME_STEP:
             raise InputError("autoreset_mode", value=mode.value, rule="must be 'SameStep' for stable-baselines3")
@@ -64,18 +68,19 @@ class TactileVecEnv(_DictVecEnv):
 
     def reset(self) -> Observations:
         """Begin episodes in all environments, with the seeds that ``seed`` has set."""
-        observation, _ = self.env.reset(seed=self._seeds)
+        is_warp = isinstance(self.env, WarpVectorEnv)
+        observation, _ = self.env.reset(seed=self._seeds[0] if is_warp else self._seeds)  # type: ignore[arg-type]
         self._reset_seeds()
         self._reset_options()
-        return observation
+        return _on_host(observation)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions for ``step_wait``."""
         self._actions = actions
 
     def step_wait(self) -> Step:
-        """Step with the actions kept. Raises ``InputError``, naming the environment, for one that is not finite or out of bounds."""
-        return _vec_env_step(*self.env.step(self._actions))
+        """Step with the actions kept; InputError names an environment not finite or out of bounds."""
+        return _vec_env_step(*(_on_host(one) for one in self.env.step(self._actions)))
 
 
 class ProcessVecEnv(_DictVecEnv):
@@ -110,7 +115,7 @@ class ProcessVecEnv(_DictVecEnv):
         return _joined([observation for observation, _ in self._workers.replies()])
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Start the step in all processes. Raises ``InputError``, naming the environment, for actions that are not finite."""
+        """Start the step in all processes; InputError names an environment not finite."""
         actions = np.asarray(actions)
         if not np.isfinite(actions).all():
             env = int(np.argwhere(~np.isfinite(actions))[0, 0])
@@ -118,7 +123,7 @@ class ProcessVecEnv(_DictVecEnv):
         self._workers.send("step", np.split(actions, len(self._workers)))
 
     def step_wait(self) -> Step:
-        """Wait for the step. Raises as ``TactileVecEnv.step_wait``; the message names the process and its environments."""
+        """Wait for the step; as ``TactileVecEnv.step_wait``, naming the process of an error."""
         steps = [_vec_env_step(*reply) for reply in self._workers.replies()]
         observations, rewards, dones, infos = zip(*steps, strict=True)
         return _joined(observations), np.concatenate(rewards), np.concatenate(dones), [info for part in infos for info in part]
@@ -126,6 +131,13 @@ class ProcessVecEnv(_DictVecEnv):
     def close(self) -> None:
         """End the processes."""
         self._workers.close()
+
+
+def _on_host(values: Any) -> Any:
+    """Arrays of NumPy in place of tensors, in dictionaries too."""
+    if isinstance(values, dict):
+        return {name: _on_host(value) for name, value in values.items()}
+    return values.cpu().numpy() if isinstance(values, torch.Tensor) else values
 
 
 def _joined(parts: Sequence[Observations]) -> Observations:
@@ -141,5 +153,8 @@ def _vec_env_step(
         for success, failed, cut in zip(info["success"], info["failed"], truncated, strict=True)
     ]
     for b in np.flatnonzero(terminated | truncated):
-        infos[b]["terminal_observation"] = info["final_obs"][b]
+        final = info["final_obs"]
+        infos[b]["terminal_observation"] = (
+            {name: values[b].copy() for name, values in final.items()} if isinstance(final, dict) else final[b]
+        )
     return observation, reward.astype(np.float32), terminated | truncated, infos

@@ -1,4 +1,4 @@
-"""Policies written by hand from the state of the batch: they show that a task can be done, and the return that this gives."""
+"""Policies written by hand from the batch's state, to show a task's return."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def roll_ball(batch: TaskBatch) -> np.ndarray:
 
 
 def balance_pole(batch: TaskBatch) -> np.ndarray:
-    """A linear quadratic regulator of a pole on a cart: state x, ẋ, θ, θ̇, input ẍ; thin rod, θ̈ = 3g/2L θ − 3/2L ẍ."""
+    """Linear quadratic regulator of a thin pole on a cart: θ̈ = 3g/2L θ − 3/2L ẍ."""
     axis, spin = batch.body[:, :3, 2], batch.body_speed[:, 3:]
     lean, rate = axis[:, :2], np.stack([spin[:, 1], -spin[:, 0]], axis=1)
     commanded = batch.action[:, :2] * 2e-3 / batch.control_timestep
@@ -62,7 +62,7 @@ def lift_cube(batch: TaskBatch) -> np.ndarray:
 
 
 def insert_peg(batch: TaskBatch) -> np.ndarray:
-    """Grasp the peg, lift it, carry it over the true place of the socket, which the observation does not tell, and put it in."""
+    """Grasp the peg, lift it and put it in the socket, whose true place is not observed."""
     peg, axis, tool = batch.body[:, :3, 3], batch.body[:, :3, 2], batch.tool[:, :3, 3]
     tip = peg - 0.025 * axis
     grasped, action = _grasp(batch, peg + 0.011 * axis - tool)
@@ -85,7 +85,7 @@ def open_drawer(batch: TaskBatch) -> np.ndarray:
 
 
 def _grasp(batch: TaskBatch, off: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pads that hold something (B,), and actions (B, 4) that bring the tool to a place ``off`` [m] (B, 3) from it and close there."""
+    """Pads that hold something (B,), and actions (B, 4) to close ``off`` [m] (B, 3) away."""
     force = np.minimum(*(-batch.world.state().wrench[name][:, 2] for name in ("left", "right")))
     grasped, over, down = force > 3.0, np.linalg.norm(off[:, :2], axis=1) < 2e-3, np.abs(off[:, 2]) < 2e-3
     action = np.zeros((len(off), 4))

@@ -1,10 +1,14 @@
-"""Observations that every task has, of B environments; arrays of NumPy, or of PyTorch on any device."""
+"""Observations that every task has, of B environments; NumPy, or PyTorch on a device."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import numpy as np
 from array_api_compat import array_namespace
 
 from raytac.envs.task_rules import Array
+from raytac.observe import ArraySpec, TactileObserver
 
 _LENGTH, _SPEED = 0.1, 1.0
 """Scales of positions [m] and speeds [m/s, rad/s]."""
@@ -30,7 +34,24 @@ def state_and_goal(
 
 
 def body_from_tool(tool: Array, body: Array, speed: Array) -> Array:
-    """``body`` (B, 15), float32: position from the tool, first two columns of the rotation, velocity and angular velocity (B, 6)."""
+    """``body`` (B, 15): position from the tool, two columns of the rotation, velocities."""
     xp = array_namespace(tool)
     place = (body[:, :3, 3] - tool[:, :3, 3]) / _LENGTH
     return xp.astype(xp.concat([place, body[:, :3, 0], body[:, :3, 1], speed / _SPEED], axis=1), xp.float32)
+
+
+def observation_arrays(
+    actions: int, *, has_grip: bool, body_seen: bool, observers: Mapping[str, TactileObserver]
+) -> dict[str, ArraySpec]:
+    """Shape, type and bounds of every observation of one environment.
+
+    They are ``state``, ``goal``, perhaps ``body``, and ``<sensor>_<modality>``.
+
+    Args:
+        has_grip: there is a gap between two pads.
+    """
+    sizes = {"state": 9 + has_grip + actions, "goal": 3} | ({"body": 15} if body_seen else {})
+    specs = {name: ArraySpec((n,), np.float32, -np.inf, np.inf) for name, n in sizes.items()}
+    for name, observer in observers.items():
+        specs |= {f"{name}_{modality}": spec for modality, spec in observer.arrays.items()}
+    return specs

@@ -1,4 +1,4 @@
-"""Rules of a task: motion of the tool, start, reward and end of an episode. Batches, SI units, world frame.
+"""Rules of a task: motion of the tool, start, reward and end. Batches, SI, world frame.
 
 Arrays are NumPy's, or PyTorch's on any device: rules are written once, by the functions that both have (array API standard). They copy
 nothing between host and device and never wait, so that a step can be recorded as a CUDA graph. (Hence the arrays' method ``clip``: the
@@ -22,11 +22,10 @@ Array = Any
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion that an action commands. The tool is the site that the arm steers: the pad, or the midpoint of two pads."""
+    """Motion that an action commands of the tool: the pad, or the midpoint of two pads."""
 
     axes: tuple[str, ...]
-    """One component of the action each: ``x``, ``y``, ``z`` along and ``rx``, ``ry``, ``rz`` about the world's axes; last, ``grip`` the
-    opening."""
+    """Components of the action: ``x``, … along, ``rx``, … about world axes; last ``grip``, gap."""
     step: tuple[float, ...]
     """Change of the target in a control step for an action of 1 [m, rad]."""
     low: tuple[float, float, float]
@@ -34,13 +33,13 @@ class Motion:
     high: tuple[float, float, float]
     """Upper corner of that box [m]."""
     leash: float = 0.01
-    """Greatest lead of the target over the tool along an axis [m]; with the arm's springs it bounds the force of a press."""
+    """Greatest lead of the target over the tool along an axis [m]; it bounds a press's force."""
     turn: float = 0.35
     """Greatest rotation of the target from the start [rad]."""
     opening: tuple[float, float] = (0.0, 0.08)
     """Least and greatest opening that an action can command [m]."""
     joint_step: float = 0.05
-    """Change of a joint's target in a control step for an action of 1, with ``action="joints"`` [rad]."""
+    """Change of a joint's target in a step for an action of 1, with ``joints`` [rad]."""
     joint_leash: float = 0.1
     """Greatest lead of a joint's target over the joint [rad]."""
     frequency: float = 30.0
@@ -116,7 +115,7 @@ class Task(ABC):
 
     @abstractmethod
     def starts(self, u: Array, tool: Array, body: Array) -> Starts:
-        """Starts of n episodes from uniform random numbers ``u`` (n, ``draws``) in [0, 1), and poses (4, 4) in the scene."""
+        """Starts of n episodes from uniform ``u`` (n, ``draws``) in [0, 1) and scene poses (4, 4)."""
 
     @abstractmethod
     def evaluate(self, state: TaskState) -> TaskResult:
@@ -124,7 +123,7 @@ class Task(ABC):
 
     @staticmethod
     def effort(state: TaskState) -> dict[str, Array]:
-        """Terms of every task: −1e-4 |a − a₋₁|² and −1e-4 |q̇|² (Isaac Lab's lift task, its weights at the start)."""
+        """Terms of every task: −1e-4 |a − a₋₁|² and −1e-4 |q̇|², as Isaac Lab's lift task starts."""
         return {
             "action_rate": -1e-4 * squared(state.action - state.last_action),
             "joint_speed": -1e-4 * squared(state.joint_speed),
@@ -149,7 +148,7 @@ def near(distance: Array, width: float) -> Array:
 
 
 def constant(values: Sequence[float], like: Array) -> Array:
-    """A vector of the type and on the device of another array, where it is made: nothing is copied from the host."""
+    """Vector of another array's type, made on its device: nothing is copied from the host."""
     result = array_namespace(like).empty((len(values),), dtype=like.dtype, device=device(like))
     for k, value in enumerate(values):
         result[k : k + 1] = value  # a slice is filled on the device, a single element would be copied there
@@ -157,7 +156,7 @@ def constant(values: Sequence[float], like: Array) -> Array:
 
 
 def between(u: Array, low: float, high: float) -> Array:
-    """Numbers spread evenly over an interval, from those in [0, 1), as ``numpy.random.Generator.uniform`` makes them."""
+    """Numbers in an interval from those in [0, 1), as ``numpy.random.Generator.uniform``."""
     return low + (high - low) * u
 
 
@@ -168,13 +167,13 @@ def moved(point: Array, x: Array, y: Array) -> Array:
 
 
 def around(points: Array, angle: Array, distance: Array) -> Array:
-    """Points (n, 3) at a distance from points (n, 3), in the horizontal direction of an angle [rad], each (n,)."""
+    """Points (n, 3) at a distance from ``points`` along a horizontal angle [rad], (n,)."""
     xp = array_namespace(points)
     return moved(points, distance * xp.cos(angle), distance * xp.sin(angle))
 
 
 def turned(rotation: Array, angle: Array) -> Array:
-    """Rotations (n, 3, 3): one rotation (3, 3) turned about the world's z axis by angles (n,) [rad]."""
+    """Rotations (n, 3, 3): ``rotation`` (3, 3) turned about world z by angles (n,) [rad]."""
     xp = array_namespace(angle)
     zero = xp.zeros_like(angle)
     return rotations(xp.stack([zero, zero, angle], axis=1)) @ rotation

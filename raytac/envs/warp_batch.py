@@ -1,4 +1,4 @@
-"""``WarpBatch``: B environments of one task on MuJoCo Warp, from actions to observations, rewards and ends, all on one device."""
+"""``WarpBatch``: B environments of one task on MuJoCo Warp, all on one device."""
 
 # pyright: reportMissingImports=false
 # (PyTorch belongs to the extra "rl", which the tests do without.)
@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -16,24 +15,28 @@ import warp as wp
 
 from raytac.checks import check_whole
 from raytac.envs.action_targets import ToolTargets
-from raytac.envs.batch import task_settings
-from raytac.envs.task_observation import body_from_tool, state_and_goal
-from raytac.envs.task_outcome import task_outcome
-from raytac.envs.task_rules import Starts, Task, TaskState
+from raytac.envs.task_observation import observation_arrays
+from raytac.envs.task_progress import TaskProgress
+from raytac.envs.task_rules import Starts, Task
+from raytac.envs.task_sensors import TaskSensors
+from raytac.envs.variations import VariationRanges, on_mounted_pad
 from raytac.envs.warp_touch import WarpTouch
 from raytac.errors import InputError
-from raytac.observe import ObservationSettings
+from raytac.observe import ObservationSettings, Randomization
+from raytac.physics.registry import checked_physics
 from raytac.robots.pose_errors import PoseErrors
 from raytac.specs.task import TaskScene
-from raytac.specs.task_file import load_task
+from raytac.world.device_variation import DeviceVariation
+from raytac.world.environment_models import Variation
 from raytac.world.warp_world import WarpWorld
 
 
 @dataclass(frozen=True)
 class WarpStep:
-    """Result of a step of B environments; tensors (B,) or (B, …). Where an episode has ended, the observation is the next one's first."""
+    """Result of a step of B environments; tensors (B,) or (B, …)."""
 
     observation: dict[str, torch.Tensor]
+    """The first one of an episode that has begun in this step."""
     reward: torch.Tensor
     terminated: torch.Tensor
     truncated: torch.Tensor
@@ -42,10 +45,12 @@ class WarpStep:
     success: torch.Tensor
     failed: torch.Tensor
     """Environments whose physics broke down: truncated, with reward 0."""
+    final: dict[str, torch.Tensor] | None = None
+    """Observation before episodes begin, if it was asked for."""
 
 
 class WarpBatch:
-    """B environments of one task, whose episodes begin again in the step in which they end.
+    """B environments of one task.
 
     .. code-block:: python
 
@@ -53,16 +58,15 @@ class WarpBatch:
         observation = batch.reset()
         step = batch.step(policy(observation))
 
-    Rewards, ends, starts, targets and observations are those of ``TaskBatch``. Starts are drawn from one generator of the device. Nothing
-    in a step waits for the device, but for images, which another library renders.
+    Rewards, ends, starts, variations, targets and observations are those of ``TaskBatch``. All is drawn from one generator of the device,
+    for every environment in every step, so that no draw depends on which of them begin. Nothing in a step waits for the device, but for
+    images, which another library renders.
 
     Attributes:
         world: the worlds.
-        task, num_envs, max_episode_steps, body_seen: as of ``TaskBatch``.
+        task, num_envs, max_episode_steps, body_seen, arrays: as of ``TaskBatch``.
         device: of all tensors.
         size: of an action.
-        steps: since the start of each episode, (B,), int64; writing to them ends episodes as much earlier.
-        start_tool, start_body: poses (4, 4) of the tool and of the task's body in the scene.
         body_observation: pose and velocity of the body (B, 15) as they are observed if ``body_seen``; for a critic they always are.
     """
 
@@ -73,6 +77,7 @@ class WarpBatch:
         num_envs: int = 1,
         tactile: ObservationSettings | Sequence[str] | str | None = "task",
         body_seen: bool | None = None,
+        randomization: Randomization | None = None,
         max_episode_steps: int | None = None,
         device: str = "auto",
         seed: int = 0,
@@ -86,7 +91,7 @@ class WarpBatch:
         """Make the worlds; ``reset`` begins the episodes.
 
         Args:
-            task, num_envs, tactile, body_seen, max_episode_steps, seed, scene, pitch: as of ``TaskBatch``.
+            task, num_envs, tactile, body_seen, randomization, max_episode_steps, seed, scene, pitch: as of ``TaskBatch``.
             device, launches, contacts, rows: as of ``WarpWorld``.
             patches: most separate contacts of a pad, for its markers; more are an error of ``check``.
 
@@ -95,44 +100,59 @@ class WarpBatch:
         """
         length = task.max_episode_steps if max_episode_steps is None else max_episode_steps
         self.task, self.num_envs, self.max_episode_steps = task, num_envs, check_whole("max_episode_steps", length)
-        settings = task_settings(task.tactile if isinstance(tactile, str) and tactile == "task" else tactile)
-        loaded = scene if isinstance(scene, TaskScene) else load_task(task.scene if scene is None else scene)
-        frequency = task.motion.frequency
+        given = {"physics": checked_physics("rigid"), "scene": scene, "randomization": randomization}
+        sensors = TaskSensors.of(task, tactile, **given, num_envs=num_envs, seed=seed)
+        loaded, frequency = sensors.scene, task.motion.frequency
         self.world = world = WarpWorld(
             loaded, num_envs=num_envs, device=device, frequency=frequency, launches=launches, contacts=contacts, rows=rows
         )
-        self.touch = None if settings is None else WarpTouch(world, settings, pitch=pitch, patches=patches, seed=seed)
         self.device = torch.device(wp.device_to_torch(world.engine.device))
-        self.body_seen = task.body_seen if body_seen is None else body_seen
+        self._generator = torch.Generator(self.device)
+        self._generator.manual_seed(seed)
         self._names = [mounted.name for mounted in world.composed.sensors]
+        observers, grid = sensors.observers(self._names), sensors.pitch if pitch is None else pitch
+        self.touch = None
+        if observers:
+            self.touch = WarpTouch(world, observers, pitch=grid, patches=patches, generator=self._generator)
+        self.body_seen = task.body_seen if body_seen is None else body_seen
         self._state = {name: wp.to_torch(array) for name, array in world.state.items()}
         self._wrenches, self._active = wp.to_torch(world.contact.wrenches), wp.to_torch(world.engine.active)
         self._body_at = list(world.composed.bodies).index(task.body)
-        self.start_tool, self.start_body = self._state["tool"][0].clone(), self._body_now()[0].clone()
+        self._ranges = VariationRanges(loaded, self._names, sensors.randomization, rigid=True)
+        self._variation = None if self._ranges.is_none else DeviceVariation(world.composed, world.engine, world.contact)
+        self._start_pads = self._state["pads"][0].clone()
         opening = world.composed.opening
         self._control = ToolTargets(
             task.motion, self._state["tool"], 0.0 if opening is None else float(world.composed.ctrl[opening])
         )
         self.size = len(task.motion.axes)
-        self._generator = torch.Generator(self.device)
-        self._generator.manual_seed(seed)
+        self.arrays = observation_arrays(
+            self.size, has_grip=self._control.has_grip, body_seen=self.body_seen, observers=observers
+        )
         self._errors = PoseErrors(num_envs, 2, device=str(world.engine.device))
-        zeros = partial(torch.zeros, dtype=torch.float64, device=self.device)
-        self.steps = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
-        self._goal, self._action = zeros(num_envs, 3), zeros(num_envs, self.size)
-        self._tool, self._body = self._state["tool"].clone(), self._body_now().clone()
-        self._speed, self._body_speed, self._turn = zeros(num_envs, 3), zeros(num_envs, 6), zeros(num_envs, 3)
+        steps = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
+        now, duration = (self._state["tool"], self._body_now(), steps), self.control_timestep
+        self._progress = TaskProgress(task, *now, actions=self.size, duration=duration, errors=self._errors)
         # What graphs read and write stays where it is.
         self._ended = torch.ones(num_envs, dtype=torch.bool, device=self.device)
         self._tool_target, self._tool_twist = wp.to_torch(world.tool_target), wp.to_torch(world.tool_twist)
-        self._tool_target.copy_(self._tool)
+        self._tool_target.copy_(self._state["tool"])
         self._opening = None if world.opening is None else wp.to_torch(world.opening)
-        starts = self._draw()
-        self._placed = {name: poses.clone() for name, poses in starts.bodies.items()}
+        self._placed = {name: poses.clone() for name, poses in self._draw().bodies.items()}
+        self._varied: dict[tuple[str, str], torch.Tensor] = {}
+        self._kinds: tuple[str, ...] = ()
+        if self._variation is not None:
+            drawn = self._draw_variation()
+            self._kinds = tuple(name for name in self._variation.names if getattr(drawn, name))
+            for kind in self._kinds:
+                columns = wp.to_torch(self._variation.arrays[kind])
+                self._varied |= {(kind, name): columns[:, k] for k, name in enumerate(self._variation.names[kind])}
+            self._vary(drawn)
         ended = wp.from_torch(self._ended, dtype=wp.bool)
         placed = {name: wp.from_torch(poses) for name, poses in self._placed.items()}
         self._begin_graph = self._captured(lambda: self._launch_begin(ended, placed))
         self._step_graph = self._captured(self._launch_step)
+        self._look_graph = (lambda: None) if self.touch is None else self._captured(self.touch.launch)
         self._begun = False
 
     @property
@@ -141,61 +161,93 @@ class WarpBatch:
         return self.world.composed.control_timestep
 
     @property
+    def steps(self) -> torch.Tensor:
+        """Steps since the start of each episode, (B,), int64; writing to them ends episodes as much earlier."""
+        return self._progress.steps
+
+    @property
+    def start_tool(self) -> torch.Tensor:
+        """Pose (4, 4) of the tool in the scene."""
+        return self._progress.start_tool
+
+    @property
+    def start_body(self) -> torch.Tensor:
+        """Pose (4, 4) of the task's body in the scene."""
+        return self._progress.start_body
+
+    @property
     def wrench(self) -> dict[str, torch.Tensor]:
-        """Wrench (B, 6) on every sensor in the last step, pad frame [N, N m]; it is overwritten by the next."""
+        """Wrench (B, 6) on every sensor in the last step, pad frame [N, N m], until the next."""
         return {name: self._wrenches[:, k] for k, name in enumerate(self._names)}
 
-    def reset(self, seed: int | None = None) -> dict[str, torch.Tensor]:
-        """Begin all episodes and return the observation; ``seed`` makes their starts, and all later ones, repeatable."""
+    def reset(self, seed: int | None = None, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+        """Begin episodes and return the observation of all.
+
+        Args:
+            seed: makes all that is drawn from now on repeatable.
+            mask: environments (B,), bool; None for all. The others keep their last observation of touch.
+
+        Raises ``InputError`` for a mask of another shape or type, and for one that leaves out environments before all have begun once.
+        """
+        if mask is not None:
+            self._check_mask("mask", mask)
+            if not self._begun:
+                raise InputError("mask", value="given", rule="must be None in the first reset")
         if seed is not None:
             self._generator.manual_seed(seed)
-        self._ended.fill_(True)
         with self._stream():
-            self._begin()
+            self._begin(torch.ones_like(self._ended) if mask is None else mask.to(self.device))
             self._begun = True
-            return self._observe()
+            return self._observe(mask)
 
-    def step(self, actions: torch.Tensor) -> WarpStep:
-        """One control step of every environment; ``actions`` (B, size) are cut to [−1, 1], and NaN is 0.
+    def step(self, actions: torch.Tensor, begin: torch.Tensor | None = None, *, final: bool = False) -> WarpStep:
+        """One control step; ``actions`` (B, size) are cut to [−1, 1], and NaN is 0.
+
+        Args:
+            actions: of all environments.
+            begin: environments (B,), bool, that begin an episode in place of this step, with reward 0; the others go on, ended or not.
+                None: episodes begin again in the step in which they end.
+            final: observe also what the step led to, before episodes begin: surfaces, markers and images are computed twice.
 
         Raises:
-            InputError: actions of another shape, or no ``reset`` before.
+            InputError: arrays of another shape, or no ``reset`` before.
         """
         if tuple(actions.shape) != (self.num_envs, self.size):
             raise InputError("actions", value=tuple(actions.shape), rule=f"must have shape {(self.num_envs, self.size)}")
         if not self._begun:
             raise InputError("reset", value="not called", rule="must be called before the first step")
+        if begin is not None:
+            self._check_mask("begin", begin)
         actions = torch.nan_to_num(actions.detach().to(self.device, torch.float64)).clamp(-1.0, 1.0)
         with self._stream():
             self._aim(actions)
             self._step_graph()
-            dt, tool, body = self.control_timestep, self._state["tool"], self._body_now()
-            moved, turned = self._errors((body, self._body), (tool, self.start_tool))
-            self._speed, self._body_speed, self._turn = (tool[:, :3, 3] - self._tool[:, :3, 3]) / dt, moved / dt, turned[:, 3:]
-            self._tool, self._body = tool.clone(), body.clone()
-            last, self._action = self._action, actions
-            self.steps += 1
-            state = TaskState(
-                tool=self._tool,
-                speed=self._speed,
-                body=self._body,
-                body_speed=self._body_speed,
-                goal=self._goal,
-                wrench=self.wrench,
-                opening=self._gap(),
-                joint_speed=self._state["speed"],
-                action=actions,
-                last_action=last,
-            )
+            self._progress.advance(self._state["tool"].clone(), self._body_now().clone(), actions)
+            if final:
+                self._look_graph()
             failed = ~self._active
-            end = task_outcome(self.task, state, self.steps, self.max_episode_steps, failed)
-            torch.logical_or(end.terminated, end.truncated, out=self._ended)
-            self._begin()
-            return WarpStep(self._observe(), end.reward, end.terminated, end.truncated, end.terms, end.success, failed)
+            end = self._progress.outcome(self.wrench, self._gap(), self._state["speed"], failed, self.max_episode_steps)
+            seen = self._observe(~failed) if final else None
+            reward, terms = end.reward, end.terms
+            terminated, truncated, success = end.terminated, end.truncated, end.success
+            began: torch.Tensor = torch.logical_or(terminated, truncated)
+            if begin is not None:
+                began = begin.to(self.device)
+                terms = {name: torch.where(began, 0.0, term) for name, term in terms.items()}
+                reward = torch.where(began, 0.0, reward)
+                terminated, truncated, success, failed = (one & ~began for one in (terminated, truncated, success, failed))
+            self._begin(began)
+            observation = self._observe(began if final else began | self._active)
+            return WarpStep(observation, reward, terminated, truncated, terms, success, failed, seen)
+
+    def _check_mask(self, name: str, mask: torch.Tensor) -> None:
+        if tuple(mask.shape) != (self.num_envs,) or mask.dtype != torch.bool:
+            rule = f"must be a mask of {self.num_envs} environments"
+            raise InputError(name, value=(tuple(mask.shape), str(mask.dtype)), rule=rule)
 
     def check(self) -> None:
         """Wait for the device. Raises ``InputError`` if contacts were lost for want of memory."""
-        self.world.check()
+        self.world.engine.check_overflow()
         if self.touch is not None:
             self.touch.check()
 
@@ -211,38 +263,47 @@ class WarpBatch:
             self._control.grip(actions)
             self._opening.copy_(self._control.gap[:, None])
 
-    def _begin(self) -> None:
-        """Begin episodes where one has ended, by a mask: whether one has, the host does not know."""
+    def _begin(self, mask: torch.Tensor) -> None:
+        """Begin episodes by a mask (B,): whether there are any, the host does not know."""
+        self._ended.copy_(mask)
         starts, ended = self._draw(), self._ended
-        for name, poses in starts.bodies.items():
+        bodies, pad = starts.bodies, self.task.stands_on
+        if self._variation is not None:
+            drawn = self._draw_variation()
+            self._vary(drawn)
+            if pad is not None and pad in drawn.mounting:
+                nominal = self._start_pads[self._names.index(pad)]
+                bodies = on_mounted_pad(self.task.body, bodies, nominal, drawn.mounting[pad])
+        for name, poses in bodies.items():
             self._placed[name].copy_(poses)
         self._begin_graph()
-        tool, body = self._state["tool"], self._body_now()
-        begun = ended[:, None]
-        self._goal = torch.where(begun, starts.goal, self._goal)
-        self._tool, self._body = (
-            torch.where(begun[..., None], now, old) for now, old in ((tool, self._tool), (body, self._body))
-        )
-        self._speed, self._body_speed, self._action = (
-            torch.where(begun, 0.0, old) for old in (self._speed, self._body_speed, self._action)
-        )
-        turn = self._errors((self._tool, self.start_tool))[0, :, 3:]
-        self._turn = torch.where(begun, turn, self._turn)
-        self.steps.masked_fill_(ended, 0)
+        tool = self._state["tool"]
+        self._progress.begin(ended, tool, self._body_now(), starts.goal)
         self._control.begin(ended, tool)
+        if self.touch is not None:
+            self.touch.begin(ended)
 
     def _draw(self) -> Starts:
         u = torch.rand(self.num_envs, self.task.draws, generator=self._generator, dtype=torch.float64, device=self.device)
         return self.task.starts(u, self.start_tool, self.start_body)
 
-    def _observe(self) -> dict[str, torch.Tensor]:
-        """Observations of all environments, float32 and images of 8 bit."""
-        result = state_and_goal(self._tool, self.start_tool, self._turn, self._speed, self._gap(), self._action, self._goal)
-        self.body_observation = body_from_tool(self._tool, self._body, self._body_speed)
+    def _draw_variation(self) -> Variation:
+        shape = self.num_envs, self._ranges.count
+        u = torch.rand(shape, generator=self._generator, dtype=torch.float64, device=self.device)
+        return self._ranges.of(2.0 * u - 1.0)
+
+    def _vary(self, drawn: Variation) -> None:
+        """Write what was drawn to where the graph reads it."""
+        for (kind, name), column in self._varied.items():
+            column.copy_(getattr(drawn, kind)[name])
+
+    def _observe(self, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
+        """Observations of all environments, float32 and images of 8 bit; touch of those of a mask (B,), None for all."""
+        result, self.body_observation = self._progress.observation(self._gap()), self._progress.body_observation()
         if self.body_seen:
             result["body"] = self.body_observation
         if self.touch is not None:
-            result |= self.touch.observe()
+            result |= self.touch.observe(mask)
         return result
 
     def _gap(self) -> torch.Tensor:
@@ -258,6 +319,8 @@ class WarpBatch:
         self.world.launch()
 
     def _launch_begin(self, ended: wp.array, placed: dict[str, wp.array]) -> None:
+        if self._variation is not None:
+            self._variation.launch(ended, self._kinds)
         self.world.reset(envs=ended, bodies=placed)
         if self.touch is not None:
             self.touch.forget(ended)

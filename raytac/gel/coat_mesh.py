@@ -10,7 +10,7 @@ import numpy as np
 from raytac.errors import InputError
 
 _OUTSIDE = -1e-6
-"""Barycentric coordinate from which a point counts as outside a triangle: rounding on a shared edge is not outside."""
+"""Barycentric coordinate below which a point is outside a triangle, beyond rounding."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -24,7 +24,7 @@ class CoatMesh:
     rest: np.ndarray
     """Vertices [m], shape (V, 3), float64, z the height of the surface at rest."""
     faces: np.ndarray
-    """Vertex numbers, shape (F, 3), int32, counter-clockwise seen from +z (from the object); they cover the face without overlap."""
+    """Vertex numbers (F, 3), int32, counter-clockwise seen from +z; they tile the face."""
     lines_x: np.ndarray
     """x of the columns [m], shape (nx,), ascending, from edge to edge of the pad."""
     lines_y: np.ndarray
@@ -61,7 +61,7 @@ class DeformedCoat:
 
     mesh: CoatMesh
     positions: np.ndarray
-    """Vertices [m], shape (B, V, 3), float64, pad frame: where the image shows them (see ``SoftReader``)."""
+    """Vertices [m], (B, V, 3), float64, pad frame: where the image shows them (``SoftReader``)."""
 
     def __post_init__(self) -> None:
         if self.positions.ndim != 3 or self.positions.shape[1:] != self.mesh.rest.shape:
@@ -77,12 +77,11 @@ class DeformedCoat:
 
 
 def bind_to_coat(mesh: CoatMesh, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of the mesh at rest that contain the points ``xy`` [m], shape (…, 2), seen along z.
+    """Triangles of the mesh at rest that contain points ``xy`` (…, 2) [m], seen along z.
 
     Returns vertex numbers (…, 3) and barycentric weights (…, 3).
 
-    Raises:
-        InputError: a point lies off the mesh.
+    Raises ``InputError``: a point lies off the mesh.
     """
     points = np.asarray(xy, float).reshape(-1, 2)
     corners = mesh.rest[mesh.faces][..., :2]

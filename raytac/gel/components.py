@@ -7,7 +7,10 @@ from numpy.typing import ArrayLike
 
 
 def find_runs(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Runs of True along the rows of B masks (B, Ny, Nx): (row of all B · Ny, first column, column after the last), each (R,), in order."""
+    """Runs of True along the rows of B masks (B, Ny, Nx), in order.
+
+    Returns row of all B · Ny, first column, column after the last, each (R,).
+    """
     row, column = np.divmod(find_edges(mask), mask.shape[2] + 1)
     return row[::2], column[::2], column[1::2]
 

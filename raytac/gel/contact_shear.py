@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class ContactShear:
-    """Shear of one contact of each of B pads with the body that is deepest in it, pad frame; zeros out of contact."""
+    """Shear of B pads' contacts with the deepest body, pad frame; zeros out of contact."""
 
     stretch: np.ndarray
     """Mean elastic displacement of the gel's skin along the pad's x and y [m], (B, 2)."""

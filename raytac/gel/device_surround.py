@@ -1,4 +1,4 @@
-"""``DeviceSurround``: the elastic surround of many small pads on the CPU or on CUDA, without the host."""
+"""``DeviceSurround``: the elastic surround of many small pads, without the host."""
 
 from __future__ import annotations
 
@@ -20,7 +20,9 @@ _FACE = 1e-8
 
 
 class DeviceSurround:
-    """``ElasticSurround`` with the unilateral rule; Gaussians are products with matrices along both axes, as wide as their weights matter.
+    """``ElasticSurround`` with the unilateral rule on the CPU or on CUDA.
+
+    Gaussians are products with matrices along both axes, as wide as their weights matter.
 
     Attributes:
         height: [m], (B, Ny, Nx), float32; at rest where nothing touches, and in environments that are not sound or are pierced.

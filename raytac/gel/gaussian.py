@@ -9,14 +9,15 @@ import numpy as np
 from raytac.gel.matmul import product, stacked_product
 
 _LOW_RANK_FROM = 6.0
-"""Width [nodes] from which the truncated cosine basis beats the banded product (measured on a 399 × 328 grid, two cores)."""
+"""Width [nodes] from which the cosine basis beats the banded product (399 × 328, two cores)."""
 _TAIL = 1e-6
 """Weight, relative to the peak, below which matrix entries and basis vectors are dropped."""
 
 
 def gaussian_matrix(nodes: int, width: float) -> np.ndarray:
-    """Discrete Gaussian of standard deviation ``width`` [nodes] on a line, shape (nodes, nodes), float64, rows summing to 1.
+    """Discrete Gaussian of standard deviation ``width`` [nodes], (nodes, nodes), float64.
 
+    Its rows sum to 1.
     exp(½ width² L) with L the second difference, mirrored about the end nodes (OpenCV's BORDER_REFLECT_101). This is Lindeberg's
     discrete Gaussian (T. Lindeberg, Scale-space for discrete signals, PAMI 1990): its variance is exactly width² nodes² at any
     width, also far below one node, so that results do not depend on the pitch as a sampled Gaussian's do.
@@ -58,15 +59,15 @@ class GaussianBlur:
         return _apply_right(_apply_left(rows, field), columns)
 
     def of_stack(self, fields: np.ndarray, spare: np.ndarray) -> np.ndarray:
-        """Smooth ``fields`` (B, Ny, Nx) float32 in place, each independently of the others, to the last bit; ``spare``: an array like it.
+        """Smooth fields (B, Ny, Nx) float32 in place, each as if it were alone, to the last bit.
 
-        Memory is the caller's: that of new arrays takes longer to get than the products.
+        ``spare`` is an array like ``fields``: getting memory for a new one takes longer than the products.
         """
         return _along_rows(_down_columns(self._along_y, fields, spare), self._turned_x, fields)
 
     @cached_property
     def _turned_x(self) -> _Operator:
-        """``_along_x`` transposed, in the order of memory in which a product from the right takes half the time."""
+        """``_along_x`` transposed, in the memory order that halves a product from the right."""
         if isinstance(self._along_x, tuple):
             return np.ascontiguousarray(self._along_x[0].T), np.ascontiguousarray(self._along_x[1].T)
         return [(rows, columns, np.ascontiguousarray(weights.T)) for rows, columns, weights in self._along_x]

@@ -25,7 +25,7 @@ class SplineAxis:
         """Second derivatives at the lines from the values there, shape (n, n)."""
 
     def weights(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Cell of each position ``t`` [m], and the weights of (y_i, y_{i+1}, M_i, M_{i+1}); shapes (P,) and (4, P).
+        """Cells (P,) of positions ``t`` [m], and weights (4, P) of (y_i, y_{i+1}, M_i, M_{i+1}).
 
         Positions beyond the ends take the value at the end.
         """

@@ -5,32 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 _ONE_THREAD = 250_000
-"""Multiply-adds in one product. OpenBLAS wakes its threads above 262,144, which for work so small costs more than it saves, and
-far more on a busy machine; below it, the result does not depend on the number of threads either."""
+"""Multiply-adds in one product: OpenBLAS wakes its threads above 262,144.
+
+For work so small that costs more than it saves. Below it the result does not depend on the number of threads either."""
 
 
 def product(a: np.ndarray, b: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
     """a @ b, float32, in pieces small enough to stay on the calling thread."""
-    rows, inner = a.shape
-    columns = b.shape[1]
-    if rows * inner * columns <= _ONE_THREAD:
-        return np.matmul(a, b, out=out)
-    out = np.empty((rows, columns), np.float32) if out is None else out
-    if rows >= columns:
-        step = max(_ONE_THREAD // (inner * columns), 1)
-        for start in range(0, rows, step):
-            out[start : start + step] = a[start : start + step] @ b
-    else:
-        step = max(_ONE_THREAD // (inner * rows), 1)
-        for start in range(0, columns, step):
-            out[:, start : start + step] = a @ b[:, start : start + step]
-    return out
+    return stacked_product(a[None], b, None if out is None else out[None])[0]
 
 
 def stacked_product(a: np.ndarray, b: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-    """a @ b, float32 or float64, one of both a stack of B matrices, in pieces small enough to stay on the calling thread.
+    """a @ b, float32 or float64, one of them a stack of B matrices, on the calling thread.
 
-    Each matrix of the stack is multiplied by itself, so that it does not matter which others there are.
+    Each matrix of the stack is multiplied by itself, in small pieces, so that it does not matter which others there are.
     """
     rows, inner, columns = a.shape[-2], a.shape[-1], b.shape[-1]
     if rows * inner * columns <= _ONE_THREAD:

@@ -15,22 +15,25 @@ from raytac.gel.surface import GelSurface, PadGrid
 
 _TAXIM_PIXEL = 0.0295e-3
 PYRAMID_SIGMAS = tuple(s * _TAXIM_PIXEL for s in (30.5, 15.5, 8.0, 3.5, 2.0, 1.1))
-"""Standard deviations of Taxim's pyramid [m]: OpenCV's automatic σ for kernels 201, 101, 51, 21, 11, 5 at 0.0295 mm a pixel."""
+"""Standard deviations of Taxim's pyramid [m].
+
+OpenCV's automatic σ for kernels 201, 101, 51, 21, 11, 5 at 0.0295 mm a pixel."""
 FINAL_SIGMA = 1.1 * _TAXIM_PIXEL
 """Standard deviation of the last smoothing [m]."""
 CONTACT_RULES = ("unilateral", "threshold")
 CONTACT_SCALE = 0.4
 """Share of the deepest overlap from which a node counts as in full contact."""
 FINEST = 0.2
-"""Gaussians narrower than this share of the pitch are skipped: the grid cannot resolve their effect."""
+"""Share of the pitch below which Gaussians are skipped: the grid cannot resolve them."""
 ROUNDING = 1e-5
-"""Excess of w over u in contact, as a share of the deepest overlap: above the pyramid's rounding in float32, far below any shape."""
+"""Excess of w over u in contact over the deepest overlap: above the rounding in float32."""
 _REACH = 4.8
-"""Standard deviations of all Gaussians together beyond which a contact has no effect: Φ(−4.8) is 10⁻⁶ of its depth."""
+"""Standard deviations beyond which a contact has no effect: Φ(−4.8) is 10⁻⁶ of its depth."""
 
 _TOGETHER = 16384
-"""Most nodes of a grid on which environments are smoothed together, over the whole pad: on larger ones what lies around a contact costs
-more than one call for each environment."""
+"""Most nodes of a grid whose environments are smoothed together, over the whole pad.
+
+On larger ones what lies around a contact costs more than a call for each environment."""
 _STACK = 1 << 17
 """Nodes of all environments that are processed at once, so that they stay in a core's cache."""
 
@@ -67,7 +70,7 @@ class ElasticSurround:
         contact_rule: str = "unilateral",
         contact_scale: float = CONTACT_SCALE,
     ) -> None:
-        """``sigmas`` [m], wide to narrow; ``final_sigma`` [m], 0 for none; ``contact_scale`` in [0, 1) of the threshold rule."""
+        """``sigmas`` [m], wide to narrow; ``final_sigma`` [m], 0: none; threshold's scale, [0, 1)."""
         if contact_rule not in CONTACT_RULES:
             raise InputError("contact_rule", value=contact_rule, rule="must be a known rule", choices=CONTACT_RULES)
         self.grid, self.contact_rule, self.contact_scale = grid, contact_rule, contact_scale
@@ -101,7 +104,7 @@ class ElasticSurround:
         return GelSurface(self.grid, height, contact, centre, pad_from_object)
 
     def _press_together(self, under: np.ndarray, height: np.ndarray, contact: np.ndarray, centre: np.ndarray) -> None:
-        """Write the surfaces under objects, whose undersides are ``under``: height, contact and its centre.
+        """Write height, contact and its centre under objects, whose undersides are ``under``.
 
         Environments are smoothed in one call; an environment's result does not depend on its neighbours.
         """
@@ -157,7 +160,7 @@ class ElasticSurround:
         return moments / sums[:, 0].sum(axis=1)[:, None]
 
     def _press(self, under: np.ndarray, height: np.ndarray, contact: np.ndarray) -> tuple[float, float]:
-        """Write the surface of one environment, as ``_press_together``, and return the contact's centre."""
+        """``_press_together`` of one environment; returns the contact's centre."""
         overlap = np.subtract(self.grid.rest, under).astype(np.float32)
         deepest = overlap.max()
         height[:] = np.nan if np.isnan(deepest) else self._rest
@@ -214,7 +217,7 @@ def _touched(overlap: np.ndarray) -> Piece:
 
 
 class WholeField:
-    """A field, 0 at first outside a piece ``touched``, which is set again after every Gaussian; on all nodes of a window."""
+    """Field on a window, 0 at first outside ``touched``, which every Gaussian sets again."""
 
     def __init__(
         self, values: np.ndarray, touched: Piece, window: Piece, blurs: Sequence[GaussianBlur], final: GaussianBlur | None
@@ -272,7 +275,7 @@ class ComposedGaussians:
 
 
 class LocalField:
-    """The same as ``WholeField``, as a sum of increments on ``touched``, each smoothed by all later Gaussians.
+    """``WholeField`` as a sum of increments on ``touched``, smoothed by all later Gaussians.
 
     Only the re-imposed contact is not linear, and it acts on ``touched`` alone. So the field is computed there, and at the end over the
     window. With m nodes along a side of ``touched`` and n Gaussians this takes about n² m³ multiply-adds, whatever the window.
@@ -281,7 +284,7 @@ class LocalField:
     def __init__(
         self, values: np.ndarray, touched: Piece, gaussians: ComposedGaussians, count: int, final: bool, reach: float
     ) -> None:
-        """``count`` Gaussians before an imposition, and one more if ``final``; ``reach``: standard deviations at which they end."""
+        """``count`` Gaussians before an imposition, one more if ``final``, each to ``reach`` σ."""
         self._gaussians, self._touched = gaussians, touched
         self._last, self._reach = count - 1 + final, reach
         self._increments, self._present = [values], values

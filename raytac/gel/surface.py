@@ -17,7 +17,7 @@ from raytac.specs.sensor import GelpadSpec
 
 
 def summary(record: Any, names: Sequence[str] | None = None) -> str:
-    """A dataclass on one line: arrays by type and shape, without empty fields; ``names``: fields that are shown, None for all."""
+    """One line on a dataclass: its fields ``names`` (None: all) but empty ones, arrays by shape."""
     shown = []
     for name in [f.name for f in fields(record)] if names is None else names:
         value = getattr(record, name)
@@ -137,8 +137,7 @@ def rounded_envs(envs: list[int], batch: int) -> list[int]:
 def chosen_envs(envs: ArrayLike | None, batch: int) -> list[int]:
     """Environment numbers of a mask (B,) or a list, in its order; None names all.
 
-    Raises:
-        InputError: an environment that does not exist, numbers that are not whole, or a mask of the wrong length.
+    Raises ``InputError``: an environment that does not exist, numbers that are not whole, or a mask of the wrong length.
     """
     if envs is None:
         return list(range(batch))

@@ -1,6 +1,7 @@
-"""Kernels of ``DeviceSurround``: overlap with the resting gel, Gaussians along rows and columns, contact, height; one thread a node.
+"""Kernels of ``DeviceSurround``, one thread a node.
 
-Environments without overlap are left out of all but the last kernel.
+They compute the overlap with the resting gel, Gaussians along rows and columns, contact and height. Environments without overlap are left
+out of all but the last kernel.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -29,7 +30,7 @@ def begin(
     deepest: wp.array(dtype=wp.float32),
     pierced: wp.array(dtype=wp.int32),
 ):
-    """Overlap u of bodies and resting gel, and u⁺; ``depths`` (B, bodies): greatest overlap of each; 0 of an environment not ``sound``."""
+    """Overlap u of bodies (greatest: ``depths``) and resting gel, and u⁺; 0 if not ``sound``."""
     env, j, i = wp.tid()
     if j == 0 and i == 0:
         most = wp.float64(0.0)
@@ -73,7 +74,7 @@ def along_rows(
     # outputs
     out: wp.array3d(dtype=wp.float32),
 ):
-    """Σ_k weights[k, i] field[j, k] over the ``band`` of column i; not less than the overlap if it ``imposes`` the contact."""
+    """Σ_k weights[k, i] field[j, k] over column i's ``band``, or more if it ``imposes`` contact."""
     env, j, i = wp.tid()
     if deepest[env] <= wp.float32(0.0):
         return

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from array_api_compat import array_namespace
 
 from raytac.errors import InputError
 from raytac.gel.coat_mesh import CoatMesh, bind_to_coat
@@ -66,20 +69,42 @@ def foundation_traction(surface: GelSurface, force: np.ndarray, twist: np.ndarra
         force: of the object on the gel, pad frame [N], shape (B, 3).
         twist: torque about +z through the contact's centre [N m], shape (B,).
     """
-    grid, area = surface.grid, cell_areas(surface.grid)
-    cell = (grid.pitch[0] ** 2 + grid.pitch[1] ** 2) / 12.0  # mean square distance of a cell's area from its centre
-    out = np.zeros((*surface.height.shape, 3), np.float32)
-    for b in range(surface.batch):
-        share = np.where(surface.contact[b], np.maximum(surface.indentation[b], 0.0), 0.0)
-        total = float((share * area).sum())
-        if not total > 0.0:
-            continue
-        share = share / total
-        out[b] = share[..., None] * force[b]
-        x, y = grid.x[None, :], grid.y[:, None]
-        x, y = x - (share * area * x).sum(), y - (share * area * y).sum()
-        arm = float((share * area * (x**2 + y**2)).sum())
-        if arm > cell:
-            out[b, ..., 0] -= share * twist[b] / arm * y
-            out[b, ..., 1] += share * twist[b] / arm * x
-    return out
+    grid = surface.grid
+    return spread_force((grid.x, grid.y, cell_areas(grid)), surface.contact, surface.indentation, force, twist)
+
+
+def spread_force(
+    nodes: tuple[Any, Any, Any], contact: Any, indentation: Any, force: Any, twist: Any, *, about_origin: bool = False
+) -> Any:
+    """``foundation_traction`` of arrays of NumPy, or of PyTorch on any device.
+
+    Args:
+        nodes: x of the columns (Nx,) and y of the rows (Ny,) [m], and areas (Ny, Nx) [m²].
+        contact, indentation: of the surfaces, (B, Ny, Nx), bool and [m].
+        force, twist: as there.
+        about_origin: the torque is about the pad frame's origin.
+    """
+    x, y, area = nodes
+    xp, count = array_namespace(indentation), indentation.shape[0]
+
+    def total(values: Any) -> Any:
+        """Sums over the nodes, (B, 1, 1); one row an environment, so that a sum does not depend on the batch."""
+        return xp.reshape(xp.sum(xp.reshape(values * area, (count, -1)), axis=1), (count, 1, 1))
+
+    share = xp.where(contact, indentation.clip(0.0), 0.0)
+    whole = total(share)
+    some = whole > 0.0
+    share = share / xp.where(some, whole, 1.0)
+    x, y = x[None, None, :], y[None, :, None]
+    centre = total(share * x), total(share * y)
+    if about_origin:
+        twist = twist - (centre[0][:, 0, 0] * force[:, 1] - centre[1][:, 0, 0] * force[:, 0])
+    x, y = x - centre[0], y - centre[1]
+    arm = total(share * (x * x + y * y))
+    # The mean square distance of a cell's area from its centre.
+    cell = ((x[0, 0, 1] - x[0, 0, 0]) ** 2 + (y[0, 1, 0] - y[0, 0, 0]) ** 2) / 12.0
+    turn = xp.where(arm > cell, twist[:, None, None] / xp.where(arm > cell, arm, 1.0), 0.0)
+    parts = (force[:, k, None, None] for k in range(3))
+    fx, fy, fz = (share * part for part in parts)
+    spread = xp.stack([fx - share * turn * y, fy + share * turn * x, fz], axis=-1)
+    return xp.astype(xp.where(some[..., None], spread, 0.0), xp.float32)

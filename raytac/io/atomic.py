@@ -19,8 +19,7 @@ def write_atomic(path: Path, data: bytes) -> None:
     A file of that name is replaced, and a symbolic link too: what it points to stays as it is. The folder must exist. An error or an
     interrupt leaves ``path`` as it was.
 
-    Raises:
-        OSError: the folder cannot be written, or the disk is full.
+    Raises ``OSError``: the folder cannot be written, or the disk is full.
     """
     partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PARTIAL}")
     try:

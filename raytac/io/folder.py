@@ -109,8 +109,7 @@ class FolderLock:
     def __init__(self, folder: str | Path) -> None:
         """Take the lock.
 
-        Raises:
-            InputError: another run has it, the folder cannot be written, or ``.lock`` in it is a link or no file.
+        Raises ``InputError``: another run has it, the folder cannot be written, or ``.lock`` in it is a link or no file.
         """
         folder = Path(folder)
         self._folder, self._made = folder, not folder.exists()

@@ -55,9 +55,7 @@ def write_exr(path: Path, channels: Mapping[str, np.ndarray], header: Mapping[st
     """Write float32 channels, losslessly compressed; ``header`` keys get the prefix ``raytac:``.
 
     Args:
-        path: file to write.
         channels: name to image of shape (H, W), all of one shape.
-        header: text attributes.
 
     Raises:
         InputError: no channels, shapes that differ, or a header value that is not text.

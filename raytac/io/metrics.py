@@ -42,8 +42,7 @@ def versions(distributions: Iterable[str] = VERSIONED) -> dict[str, str]:
 def check_metrics(values: Mapping[str, object]) -> dict[str, Metric]:
     """The metrics as plain ints, floats and strings, in their order.
 
-    Raises:
-        InputError: a key that is not dotted words, a value that is not a finite number or a string, or a missing required key.
+    Raises ``InputError``: a key that is not dotted words, a value that is not a finite number or a string, or a missing required key.
     """
     checked: dict[str, Metric] = {}
     for key, value in values.items():

@@ -18,7 +18,6 @@ class Progress(tqdm):
 
         Args:
             iterable: what is worked through; None for ``update`` by hand.
-            desc: name of the work.
             show: False writes nothing anywhere.
             interval: seconds from one line to the next; shorter work writes none.
             file: text stream; standard error if None.

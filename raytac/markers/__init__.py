@@ -1,4 +1,4 @@
-"""Markers: how the dots on the coat move, by four models behind one interface; see docs/markers.md."""
+"""Markers: motion of the dots on the coat by four models; see docs/markers.md."""
 
 import lazy_loader
 

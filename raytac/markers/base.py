@@ -1,4 +1,4 @@
-"""Marker models: the protocol that each follows, and the configuration that names its settings and builds it."""
+"""Protocol of marker models, and the configuration that names and builds each."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class MarkerModel(Protocol):
     """A model that moves the markers of B pads."""
 
     needs_contacts: bool
-    """True if it reads contacts: their samples, and the object's motion at each since first touch."""
+    """True if it reads contacts: samples, and the object's motion at each since first touch."""
     device: str
     """``cpu`` or ``cuda``: the device that it computes on."""
 
     def displacement(
         self, rest: np.ndarray, surface: GelSurface, samples: ContactSamples | None, contacts: Contacts | None
     ) -> np.ndarray:
-        """Displacement of markers at ``rest`` (B, M, 3) [m]: along x and y, (B, M, 2), or along x, y and z, (B, M, 3).
+        """Displacement of markers at ``rest`` (B, M, 3) [m]: (B, M, 2), or with z (B, M, 3).
 
         With two components the marker stays on the surface, whose height gives the third. ``samples`` and ``contacts`` are None for a
         model that does not need them.
@@ -37,7 +37,7 @@ class MarkerModel(Protocol):
 
 @dataclass(frozen=True)
 class MarkersConfig(ABC):
-    """Configuration of a marker model, which users pass as ``markers=``; those of all models derive from it."""
+    """Configuration of a marker model, which users pass as ``markers=``."""
 
     perturbation: MarkerPerturbation | None = None
     """Noise, lost markers and shifts of the pattern; None is none."""
@@ -46,7 +46,7 @@ class MarkersConfig(ABC):
     needs_coat: ClassVar[bool] = False
     """True if it reads ``GelSurface.coat``, which only a soft pad has."""
     follows_shear: ClassVar[bool] = False
-    """True if the gel's shear that the physics knows (``PadReading.shear``) takes the place of the object's motion since first touch."""
+    """True if ``PadReading.shear`` takes the place of the object's motion since first touch."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.perturbation, (MarkerPerturbation, type(None))):
@@ -55,12 +55,15 @@ class MarkersConfig(ABC):
             raise InputError("contacts", value=self.contacts, rule="must be a ContactSettings")
 
     def slip(self, sensor: SensorSpec) -> float | None:
-        """Shear at which a contact slips, over its mean indentation and its radius [1/m]; None: its history never slips."""
+        """Shear at which a contact slips, over mean indentation · radius [1/m]; None: never."""
         return None
 
     @abstractmethod
     def build(self, sensor: SensorSpec, grid: PadGrid, *, num_envs: int, device: str) -> MarkerModel:
-        """Build the model for surfaces on ``grid`` of ``num_envs`` environments; ``device``: ``auto``, ``cpu`` or ``cuda``.
+        """Build the model for surfaces on ``grid`` of ``num_envs`` environments.
+
+        Args:
+            device: ``auto``, ``cpu`` or ``cuda``.
 
         Raises:
             InputError: the sensor lacks what the model needs.

@@ -1,4 +1,4 @@
-"""Fit of FOTS and of the force field to surface tracking on simulated presses, and the error of every model."""
+"""Fit of FOTS and of the force field to simulated presses, and the error of every model."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ import numpy as np
 
 from raytac.gel.surface import PadGrid, rest_height
 from raytac.markers.calibration_presses import LOADS, PressFrame
-from raytac.markers.contacts import TWIST_SLIP, ContactCells, Contacts, ContactTracker
+from raytac.markers.contact_tracker import ContactTracker
+from raytac.markers.contacts import TWIST_SLIP, ContactCells, Contacts
 from raytac.markers.force_field import contact_at
 from raytac.markers.pattern import marker_centres
 from raytac.markers.registry import models_without_coat
@@ -23,9 +24,9 @@ from raytac.specs.marker_motion import MarkerMotionSpec, PunchSpec
 from raytac.specs.sensor import MarkerSpec, SensorSpec
 
 PROBE_PITCH = 1e-3
-"""Spacing of the markers that errors are averaged over [m]: a grid over the view, whatever the sensor's own pattern."""
+"""Spacing of the markers that errors are averaged over [m]: a grid over the view."""
 _MARGIN = 0.4e-3
-"""Least distance of the outermost probe from the edge of the view [m], so that none leaves it at rest."""
+"""Least distance [m] of the outermost probe from the edge of the view: none leaves it."""
 _GAIN = 1e9
 """First guess of FOTS' gain [1/m³]; the search works on its logarithm."""
 _LAMBDA = 2.5e5
@@ -35,7 +36,7 @@ _REACH = 5e-3
 
 
 def probe_sensor(sensor: SensorSpec) -> SensorSpec:
-    """The sensor with a dense, regular pattern over its view, so that a fit does not depend on its own pattern."""
+    """The sensor with a dense, regular pattern, so that a fit does not depend on its own."""
     camera = sensor.camera
     sizes, centre = [], []
     for axis in range(2):
@@ -96,8 +97,9 @@ class ProbeData:
 def pattern_search(
     cost: Callable[[np.ndarray], float], start: np.ndarray, step: float = 0.4, end: float = 2e-3
 ) -> tuple[np.ndarray, float]:
-    """Minimise by trying one coordinate at a time and halving the step (Hooke and Jeeves 1961); no derivatives, no dependence on scale.
+    """Minimise by trying one coordinate at a time and halving the step.
 
+    No derivatives, no dependence on scale (Hooke and Jeeves 1961).
     Returns the point and its cost. ``step`` and ``end`` are the first and last step along every coordinate.
     """
     point, best = np.array(start, float), cost(np.asarray(start, float))
@@ -117,7 +119,9 @@ def pattern_search(
 
 
 def fit_motion(data: ProbeData, *, device: str = "auto") -> MarkerMotionSpec:
-    """Constants that bring FOTS and the force field closest to surface tracking: least mean distance, each kind of load weighted alike.
+    """Constants that bring FOTS and the force field closest to surface tracking.
+
+    They give the least mean distance, each kind of load weighted alike.
 
     FOTS is fitted in stages, as its authors do: dilation on normal presses, then shear and twist with the dilation fixed. Shear and twist
     are fitted once as published and once as a punch (``PunchSpec``), whose three constants they share. A cap is no more than the largest
@@ -212,7 +216,7 @@ class ModelError:
     p95: float
     """95th percentile of that distance [m]."""
     moved: float
-    """Mean distance over the probes that surface tracking moves by more than 50 µm [m]; NaN if there is none."""
+    """Mean distance [m] over probes that surface tracking moves by more than 50 µm, or NaN."""
     mean_px: float
     """Mean distance in the image [px]."""
     size: float
@@ -222,10 +226,12 @@ class ModelError:
 def model_errors(
     sensor: SensorSpec, frames: Sequence[PressFrame], grid: PadGrid, *, models: Sequence[str] | None = None, device: str = "auto"
 ) -> tuple[list[ModelError], dict[str, float]]:
-    """Errors of every model by kind of load, and the median time of a frame of every model [ms] at the probes.
+    """Errors of every model by kind of load, and its median time a frame [ms] at the probes.
 
-    ``frames`` hold whole presses, in order; ``sensor`` has the marker motion that is tested. ``models``: names of ``MARKERS``; None is all
-    that need no coat.
+    Args:
+        sensor: with the marker motion that is tested.
+        frames: whole presses, in order.
+        models: names of ``MARKERS``; None is all that need no coat.
     """
     models = models_without_coat() if models is None else models
     probed = probe_sensor(sensor)

@@ -1,4 +1,4 @@
-"""Presses of the soft pad that marker models are fitted to and tested on: normal, then sheared, twisted, or both at once."""
+"""Presses of the soft pad that marker models are fitted to and tested on."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _STEPS = 4
 
 @dataclass(frozen=True)
 class Press:
-    """One trajectory: an object is pressed, then sheared or twisted; or both, a step of one and a step of the other in turn."""
+    """Path of an object: pressed, then sheared or twisted, or a step of each in turn."""
 
     name: str
     kind: str
@@ -103,7 +103,7 @@ FIT = (
     *_presses("ball4-slides", "sphere", {"radius": 4e-3}, (0.0, 0.0), 0.3e-3, (0.9e-3, 0.6e-3), 45.0),
     *_presses("punch3-slides", "cylinder", {"radius": 3e-3, "length": 6e-3}, (1.0e-3, 0.0), 0.2e-3, (-0.8e-3, 0.8e-3), 40.0),
 )
-"""Presses that models are fitted to; the last ones slide, since they are light: without them no cap could be fitted."""
+"""Presses that models are fitted to; the light ones at the end slide and give the caps."""
 HELD_OUT = (
     *_presses("ball6", "sphere", {"radius": 6e-3}, (-2.5e-3, 1.5e-3), 0.9e-3, (0.5e-3, -0.6e-3), 25.0),
     *_presses("punch2", "cylinder", {"radius": 2e-3, "length": 6e-3}, (3.0e-3, -1.5e-3), 0.8e-3, (-0.8e-3, 0.0), -30.0),
@@ -118,7 +118,7 @@ HELD_OUT = (
     _both("punch2-both", "cylinder", {"radius": 2e-3, "length": 6e-3}, (2.0e-3, -1.0e-3), 0.3e-3, (0.2e-3, 0.7e-3), 45.0),
     _both("cone-both", "cone", {"radius": 4e-3, "height": 3e-3, "tip_radius": 1.5e-3}, (-2.0e-3, 1.0e-3), 0.4e-3, (0.4e-3, -0.5e-3), -35.0),
 )  # fmt: skip
-"""Presses that no fit uses: other objects, places and directions; a lying bar, a ball that slides, and shear with twist."""
+"""Presses that no fit uses: other objects, places and directions, sliding, both loads."""
 QUICK_FIT, QUICK_HELD_OUT = FIT[:2], HELD_OUT[:2]
 """Few presses, for a quick run that shows that everything works."""
 
@@ -131,7 +131,7 @@ class PressFrame:
     load: str
     """One of ``LOADS``; ``start`` before the touch."""
     surface: GelSurface
-    """Surface of the rigid pad at the object's pose, for models of heights, with the ``coat`` of the soft pad in the same state."""
+    """Surface of the rigid pad at the object's pose, with the soft pad's ``coat``."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def simulate_press(sensor: SensorSpec, press: Press, *, level: str, device: str 
 
 
 def press_frames(sensor: SensorSpec, press: Press, states: PressStates) -> list[PressFrame]:
-    """States of a press, in order, with the rigid pad's surface at the same poses; errors as of ``simulate_press``."""
+    """States of a press with the rigid pad's surfaces there; errors as of ``simulate_press``."""
     from raytac.physics.rigid.pad import RigidPad
 
     rigid = RigidPad(sensor, press.scene(), pitch=_PITCH)

@@ -9,33 +9,37 @@ from raytac.checks import check_known, check_whole
 from raytac.gel.surface import PadGrid
 from raytac.markers.base import MarkerModel, MarkersConfig, marker_motion_of
 from raytac.markers.contacts import ContactCells
+from raytac.specs.marker_motion import MarkerMotionSpec
 from raytac.specs.press import PADS
 from raytac.specs.sensor import SensorSpec
 
 
 @dataclass(frozen=True)
 class Fots(MarkersConfig):
-    """FOTS: dilation, shear and twist by closed forms, around a disc that sticks if the sensor's marker motion has a ``punch``."""
+    """FOTS in closed forms, around a disc that sticks where the marker motion has a ``punch``."""
 
     takes_punch: ClassVar[bool] = True
     follows_shear: ClassVar[bool] = True
 
     def slip(self, sensor: SensorSpec) -> float | None:
         """As of the sensor's marker motion."""
+        punch = self.motion(sensor).punch
+        return punch.slip if punch else None
+
+    def motion(self, sensor: SensorSpec) -> MarkerMotionSpec:
+        """The sensor's marker motion as far as this model takes it."""
         motion = marker_motion_of(sensor)
-        return motion.punch.slip if self.takes_punch and motion.punch else None
+        return motion if self.takes_punch else replace(motion, punch=None)
 
     def build(self, sensor: SensorSpec, grid: PadGrid, *, num_envs: int, device: str) -> MarkerModel:
         from raytac.markers.fots import FotsModel
 
-        motion = marker_motion_of(sensor)
-        motion = motion if self.takes_punch else replace(motion, punch=None)
-        return FotsModel(motion, ContactCells.over(grid, self.contacts), device=device)
+        return FotsModel(self.motion(sensor), ContactCells.over(grid, self.contacts), device=device)
 
 
 @dataclass(frozen=True)
 class FotsPublished(Fots):
-    """FOTS as published: Gaussians with one λ for all contacts, whether or not the sensor's marker motion has a ``punch``."""
+    """FOTS as published: Gaussians with one λ for all contacts; a ``punch`` is ignored."""
 
     takes_punch: ClassVar[bool] = False
     follows_shear: ClassVar[bool] = False
@@ -59,9 +63,9 @@ class Superposition(MarkersConfig):
 
     follows_shear: ClassVar[bool] = True
     level: str = "coarse"
-    """Level of the soft pad whose unit-load fields are used; their memory grows with the square of its vertices."""
+    """Level of the soft pad whose unit loads are used; memory grows with its vertices squared."""
     rounds: int = 8
-    """Most solutions a frame, after each of which vertices lose contact or slide; it bounds the time of a frame."""
+    """Most solutions a frame; after each, vertices lose contact or slide."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -76,7 +80,7 @@ class Superposition(MarkersConfig):
 
 @dataclass(frozen=True)
 class ForceField(MarkersConfig):
-    """Penalty forces at the markers themselves, scaled to displacements by the sensor's marker motion."""
+    """Penalty forces at the markers, scaled to displacements by the sensor's marker motion."""
 
     def build(self, sensor: SensorSpec, grid: PadGrid, *, num_envs: int, device: str) -> MarkerModel:
         from raytac.markers.force_field import ForceFieldModel

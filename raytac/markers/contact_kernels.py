@@ -1,4 +1,4 @@
-"""Kernels of ``DeviceFots``: cells, connected contacts and their history, as ``ContactCells`` and ``ContactTracker`` have them."""
+"""Kernels of ``ContactHistory``: connected contacts, and the object's motion at each."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import warp as wp
 
@@ -28,6 +29,7 @@ _LEAST_DEPTH = wp.constant(wp.float64(1e-9))
 """Weight of a cell that is touched without depth [m]."""
 _TINY = wp.constant(wp.float64(1e-12))
 _LIMIT_STEPS = 6
+"""Newton steps of ``kept_shares`` in double precision."""
 
 
 @wp.struct
@@ -51,7 +53,7 @@ class Pad:
 
 @wp.struct
 class Contact:
-    """One contact, as a row of ``Contacts.table``; ``active`` is 0 or 1."""
+    """Contact as a row of ``Contacts.table``; ``place``: centre, and height of the pressed gel."""
 
     active: wp.int32
     place: wp.vec3d
@@ -115,15 +117,20 @@ def join(parent: wp.array2d(dtype=wp.int32), env: wp.int32, a: wp.int32, b: wp.i
 
 
 @wp.func
-def kept_shares(x: wp.float64, y: wp.float64) -> wp.vec2d:
-    """As ``raytac.markers.contacts.kept_shares``."""
-    gamma = wp.max(wp.max(x - _1, (y - _1) / _B), _0)
-    for _ in range(_LIMIT_STEPS):
-        p, q = _1 + gamma, _1 + _B * gamma
+def kept_shares(x: Any, y: Any, steps: wp.int32):
+    """Shares of a shear and of a twist that stick, by both over their limits.
+
+    They are those of the closest point of the ellipsoid, in energy, by Newton's method on 1 / √(x² + y²) = 1. This is a straight line in
+    γ for b = 1, from where the larger of the two alone would be; b as in ``fots``.
+    """
+    b, one, none = type(x)(_B), type(x)(1.0), type(x)(0.0)
+    gamma = wp.max(wp.max(x - one, (y - one) / b), none)
+    for _ in range(steps):
+        p, q = one + gamma, one + b * gamma
         xp, yq = x / p, y / q
         n = wp.sqrt(xp * xp + yq * yq)
-        gamma = gamma + n * n * wp.max(n - _1, _0) / wp.max(xp * xp / p + _B * yq * yq / q, _TINY)
-    return wp.vec2d(_1 / (_1 + gamma), _1 / (_1 + _B * gamma))
+        gamma = gamma + n * n * wp.max(n - one, none) / wp.max(xp * xp / p + b * yq * yq / q, type(x)(1e-12))
+    return one / (one + gamma), one / (one + b * gamma)
 
 
 @wp.func
@@ -150,22 +157,23 @@ def contact_of(m: Moments, pad: Pad) -> Contact:
 
 @wp.func
 def slipped(contact: Contact, slip: wp.float64) -> Contact:
-    """A contact with the shear and the twist that it keeps."""
+    """Contact with the shear and twist that it keeps, by ``kept_shares``."""
     result = contact
     determinant = contact.ellipse[0] * contact.ellipse[2] - contact.ellipse[1] * contact.ellipse[1]
     radius = wp.sqrt(wp.sqrt(wp.max(determinant, wp.float64(1e-24))))
     shear_max, twist_max = slip * contact.depth * radius, _TWIST_SLIP * slip * contact.depth
     x, y = wp.length(contact.shear) / wp.max(shear_max, _TINY), wp.abs(contact.twist) / wp.max(twist_max, _TINY)
     if x * x + y * y > _1:
-        shares = kept_shares(x, y)
-        result.shear = shares[0] * contact.shear
-        result.twist = shares[1] * contact.twist
+        sheared, turned = kept_shares(x, y, _LIMIT_STEPS)
+        result.shear = sheared * contact.shear
+        result.twist = turned * contact.twist
     return result
 
 
 @wp.kernel
 def detect(
     depth: wp.array3d(dtype=wp.float32),
+    windows: wp.array(dtype=wp.vec4i),
     pad: Pad,
     # work
     parent: wp.array2d(dtype=wp.int32),
@@ -175,29 +183,29 @@ def detect(
     contacts: wp.array2d(dtype=Contact),
     most: wp.array(dtype=wp.int32),
 ):
-    """Contacts of every environment, 8-connected, in the order of their first cells, without history.
+    """Contacts of every environment, 8-connected, by their first cells, without history.
 
-    ``box``: columns from, to and rows from, to of the cells in contact. ``most``: greatest number of contacts of an environment so far;
-    those beyond the memory are left out.
+    ``windows``: columns from, to and rows from, to, beyond which no cell is looked at; ``box``: the same of the cells in contact. ``most``:
+    greatest number of contacts of an environment so far; those beyond the memory are left out.
     """
     env = wp.tid()
-    rows, columns, room = depth.shape[1], depth.shape[2], contacts.shape[1]
+    rows, columns, room, window = depth.shape[1], depth.shape[2], contacts.shape[1], windows[env]
     c0, c1, r0, r1 = wp.int32(columns), wp.int32(0), wp.int32(rows), wp.int32(0)
-    for row in range(rows):
-        for column in range(columns):
+    for row in range(window[2], window[3]):
+        for column in range(window[0], window[1]):
             cell = row * columns + column
             parent[env, cell] = -1
             if depth[env, row, column] >= wp.float32(0.0):
                 c0, c1 = wp.min(c0, column), wp.max(c1, column + 1)
                 r0, r1 = wp.min(r0, row), wp.max(r1, row + 1)
                 parent[env, cell] = cell
-                if column > 0:
+                if column > window[0]:
                     if parent[env, cell - 1] >= 0:
                         join(parent, env, cell, cell - 1)
-                if row > 0:
+                if row > window[2]:
                     for k in range(3):
                         other = column + k - 1
-                        if other >= 0 and other < columns:
+                        if other >= window[0] and other < window[1]:
                             if parent[env, cell - columns + k - 1] >= 0:
                                 join(parent, env, cell, cell - columns + k - 1)
     for k in range(room):
@@ -258,38 +266,65 @@ def is_known(pose: wp.mat44d) -> wp.bool:
 
 
 @wp.kernel
-def follow(
+def choose_object(
     poses: wp.array3d(dtype=wp.mat44d),
-    pad_index: wp.int32,
+    pad: wp.int32,
     depths: wp.array2d(dtype=wp.float64),
     sound: wp.array(dtype=wp.bool),
     shear: Shear,
-    pad: Pad,
-    contacts: wp.array2d(dtype=Contact),
     # state
-    before: wp.array2d(dtype=Contact),
-    pose_before: wp.array(dtype=wp.mat44d),
     pressed_before: wp.array(dtype=wp.int32),
     # outputs
-    table: wp.array3d(dtype=wp.float32),
+    pose: wp.array(dtype=wp.mat44d),
+    centre: wp.array(dtype=wp.vec3d),
+    stretch: wp.array(dtype=wp.vec3d),
 ):
-    """Add the object's motion since the last surface to the contacts that it carries on, or take the physics' shear.
+    """Pose of each pad's object and shear of the gel under it, for ``follow``; else NaN and 0.
 
     ``poses`` (B, pads, bodies + pads): ``pad_from_body``; ``depths`` (B, bodies): overlap of each with the pad, of which the deepest is
     the object.
     """
     env = wp.tid()
-    bodies, room = depths.shape[1], contacts.shape[1]
     pressed, deepest = wp.int32(-1), wp.float64(0.0)
-    for body in range(bodies):
+    for body in range(depths.shape[1]):
         depth = depths[env, body] + _0
         if sound[env] and depth > deepest:
             pressed, deepest = wp.int32(body), wp.float64(depth)
-    pose = pose_before[env] * _NAN
     last = pressed_before[env] + 0
-    # From one body to another is no motion of either.
-    if pressed >= 0 and (pressed == last or last < 0):
-        pose = poses[env, pad_index, pressed]
+    pose[env] = poses[env, pad, 0] * _NAN
+    centre[env] = wp.vec3d()
+    if pressed >= 0:
+        # From one body to another is no motion of either.
+        if pressed == last or last < 0:
+            pose[env] = poses[env, pad, pressed]
+        if shear.load[env, pad, pressed][0] > _0:
+            centre[env] = shear.centre[env, pad, pressed]
+            stretch[env] = shear.mean[env, pad, pressed]
+    pressed_before[env] = wp.where(sound[env], pressed, last)
+
+
+@wp.kernel
+def follow(
+    envs: wp.array(dtype=wp.int32),
+    poses: wp.array(dtype=wp.mat44d),
+    centres: wp.array(dtype=wp.vec3d),
+    stretches: wp.array(dtype=wp.vec3d),
+    pad: Pad,
+    contacts: wp.array2d(dtype=Contact),
+    # state
+    before: wp.array2d(dtype=Contact),
+    pose_before: wp.array(dtype=wp.mat44d),
+    # outputs
+    table: wp.array3d(dtype=wp.float64),
+):
+    """Add the object's motion to contacts that go on, or take the physics' shear.
+
+    ``envs``: of each row; ``poses``: ``pad_from_object`` of each, NaN where it is not known; ``stretches``: displacement along x and y
+    and rotation of the gel at the ``centres``, which are 0 or NaN where it is not known. ``before``, ``pose_before``: of every
+    environment.
+    """
+    row = wp.tid()
+    env, room, pose = envs[row] + 0, contacts.shape[1], poses[row]
     old = pose_before[env]
     d, x, y, angle = wp.identity(n=3, dtype=wp.float64), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
     if is_known(pose) and is_known(old):
@@ -298,7 +333,7 @@ def follow(
         y = pose[1, 3] - d[1, 0] * old[0, 3] - d[1, 1] * old[1, 3] - d[1, 2] * old[2, 3]
         angle = wp.atan2(d[1, 0] - d[0, 1], d[0, 0] + d[1, 1])
     for k in range(room):
-        now = contacts[env, k]
+        now = contacts[row, k]
         if now.active == 1:
             nearest, chosen, least = wp.int32(-1), wp.vec2d(), wp.float64(1e30)
             for n in range(room):
@@ -318,50 +353,48 @@ def follow(
                     now.twist = was.twist + angle
                     if pad.slip >= _0:
                         now = slipped(now, pad.slip)
-            contacts[env, k] = now
-    if pad.follows_shear == 1 and pressed >= 0:
-        set_shear(env, pad_index, pressed, shear, pad, contacts)
+            contacts[row, k] = now
+    if pad.follows_shear == 1:
+        set_shear(row, centres[row], stretches[row], pad, contacts)
     for k in range(room):
-        now = contacts[env, k]
+        now = contacts[row, k]
         before[env, k] = now
         for n in range(table.shape[2]):
-            table[env, k, n] = wp.float32(0.0)
+            table[row, k, n] = _0
         if now.active == 1:
-            table[env, k, 0] = wp.float32(1.0)
-            table[env, k, 1] = wp.float32(now.place[0])
-            table[env, k, 2] = wp.float32(now.place[1])
-            table[env, k, 3] = wp.float32(now.shear[0])
-            table[env, k, 4] = wp.float32(now.shear[1])
-            table[env, k, 5] = wp.float32(now.twist)
+            table[row, k, 0] = _1
+            table[row, k, 1] = now.place[0]
+            table[row, k, 2] = now.place[1]
+            table[row, k, 3] = now.shear[0]
+            table[row, k, 4] = now.shear[1]
+            table[row, k, 5] = now.twist
             for n in range(3):
-                table[env, k, 6 + n] = wp.float32(now.ellipse[n])
-            table[env, k, 9] = wp.float32(now.depth)
+                table[row, k, 6 + n] = now.ellipse[n]
+            table[row, k, 9] = now.depth
+            table[row, k, 10] = now.radius
+            table[row, k, 11] = now.place[2]
     pose_before[env] = pose
-    pressed_before[env] = wp.where(sound[env], pressed, last)
 
 
 @wp.func
-def set_shear(env: wp.int32, pad_index: wp.int32, body: wp.int32, shear: Shear, pad: Pad, contacts: wp.array2d(dtype=Contact)):
-    """Give the physics' shear of one body to the contact at its place."""
-    if shear.load[env, pad_index, body][0] <= _0:
-        return
-    centre, mean = shear.centre[env, pad_index, body], shear.mean[env, pad_index, body]
-    total = centre[0] + centre[1] + centre[2] + mean[0] + mean[1] + mean[2]
+def set_shear(row: wp.int32, centre: wp.vec3d, stretch: wp.vec3d, pad: Pad, contacts: wp.array2d(dtype=Contact)):
+    """Give the physics' shear to the contact at its place."""
+    total = centre[0] + centre[1] + centre[2] + stretch[0] + stretch[1] + stretch[2]
     if not wp.isfinite(total) or (centre[0] == _0 and centre[1] == _0 and centre[2] == _0):
         return
     nearest, least = wp.int32(-1), wp.float64(1e30)
     for k in range(contacts.shape[1]):
-        if contacts[env, k].active == 1:
-            place = contacts[env, k].place
+        if contacts[row, k].active == 1:
+            place = contacts[row, k].place
             distance = wp.length(wp.vec2d(place[0], place[1]) - wp.vec2d(centre[0], centre[1]))
             if distance < least:
                 nearest, least = wp.int32(k), distance + _0
     if nearest >= 0:
-        one = contacts[env, nearest]
+        one = contacts[row, nearest]
         if least <= one.radius + pad.reach:
-            one.shear = wp.vec2d(mean[0], mean[1])
-            one.twist = mean[2] + _0
-            contacts[env, nearest] = one
+            one.shear = wp.vec2d(stretch[0], stretch[1])
+            one.twist = stretch[2] + _0
+            contacts[row, nearest] = one
 
 
 @wp.kernel
@@ -370,12 +403,18 @@ def forget(
     # outputs
     before: wp.array2d(dtype=Contact),
     pose_before: wp.array(dtype=wp.mat44d),
-    pressed_before: wp.array(dtype=wp.int32),
 ):
     """Drop the history of the environments of a mask (B,)."""
     env = wp.tid()
     if mask[env]:
         pose_before[env] = pose_before[env] * _NAN
-        pressed_before[env] = -1
         for k in range(before.shape[1]):
             before[env, k].active = 0
+
+
+@wp.kernel
+def forget_object(mask: wp.array(dtype=wp.bool), pressed_before: wp.array(dtype=wp.int32)):
+    """Drop which body was the object in the environments of a mask (B,)."""
+    env = wp.tid()
+    if mask[env]:
+        pressed_before[env] = -1

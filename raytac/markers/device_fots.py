@@ -1,31 +1,30 @@
-"""FOTS markers of many pads on the CPU or on CUDA, without the host: contacts, their history, displacements."""
+"""FOTS markers of many pads without the host: contacts, history, displacements."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
-from raytac.markers import contact_kernels, fots_kernels
-from raytac.markers.base import MarkersConfig, marker_motion_of
+from raytac.markers.base import MarkersConfig
 from raytac.markers.config import Fots
+from raytac.markers.contact_history import ContactHistory
+from raytac.markers.contact_kernels import choose_object, forget_object, pool
 from raytac.markers.contacts import ContactCells
+from raytac.markers.fots import constants_of
+from raytac.markers.fots_kernels import Cells, Drag, displace, limit
 from raytac.markers.pattern import MarkerPattern
 from raytac.specs.sensor import SensorSpec
 from raytac.warp_runtime import start_warp
-
-_COLUMNS = 10
-"""Of ``Contacts.table`` that the displacements need."""
-_NAN = wp.mat44d(*[np.nan] * 16)
 
 
 class DeviceFots:
     """Displacements of markers by ``Fots`` or ``FotsPublished``, of B pads.
 
     Attributes:
+        contacts: of the pads, with their history.
         displacement: along x and y [m], (B, M), vectors of float32; 0 of an untouched pad.
     """
 
@@ -36,11 +35,7 @@ class DeviceFots:
 
         Args:
             sensor: with markers and their motion.
-            config: of the model.
-            grid: nodes of the surfaces.
-            num_envs: number of pads B.
             patches: most separate contacts of a pad.
-            device: "cpu" or "cuda".
 
         Raises:
             InputError: another model, a perturbation, or a sensor without markers or their motion.
@@ -52,34 +47,25 @@ class DeviceFots:
         if config.perturbation is not None:
             raise InputError("perturbation", value=config.perturbation, rule="must be None on the device")
         start_warp()
-        motion, cells, self.device = marker_motion_of(sensor), ContactCells.over(grid, config.contacts), wp.get_device(device)
-        rest, slip = MarkerPattern.of(sensor).rest[0], config.slip(sensor)
-        pad: Any = contact_kernels.Pad()
-        pad.first, pad.pitch = wp.vec2d(cells.x[0], cells.y[0]), wp.vec2d(*cells.pitch)
-        pad.nodes = wp.vec2i(*cells.nodes)
-        pad.node_first, pad.node_pitch = wp.vec2d(*grid.origin), wp.vec2d(*grid.pitch)
-        pad.rest = wp.array(grid.rest, dtype=wp.float64, device=self.device)
-        pad.reach, pad.slip = config.contacts.reach, -1.0 if slip is None else slip
-        pad.follows_shear = int(config.follows_shear)
-        self._pad = pad
-        size: Any = fots_kernels.Cells()
+        cells, rest = ContactCells.over(grid, config.contacts), MarkerPattern.of(sensor).rest[0]
+        self.contacts = ContactHistory(
+            cells,
+            config.contacts.reach,
+            config.slip(sensor),
+            num_envs=num_envs,
+            room=patches,
+            follows_shear=config.follows_shear,
+            device=device,
+        )
+        self.device = self.contacts.device
+        size: Any = Cells()
         size.origin, size.pitch = wp.vec2f(cells.x[0], cells.y[0]), wp.vec2f(*cells.pitch)
-        self._cells, self._constants, self._room = size, _constants(motion, config), patches
-
-        def zeros(*shape: int, dtype: Any) -> wp.array:
-            return wp.zeros((num_envs, *shape), dtype=dtype, device=self.device)
-
+        self._cells, self._constants = size, constants_of(config.motion(sensor))
+        drag: Any = Drag
         self._xy = wp.array(rest[:, :2], dtype=wp.vec2f, device=self.device)
-        self._depth = zeros(len(cells.y), len(cells.x), dtype=wp.float32)
-        self._parent, self._box = zeros(len(cells.y) * len(cells.x), dtype=wp.int32), zeros(dtype=wp.vec4i)
-        self._moments = zeros(patches, dtype=contact_kernels.Moments)
-        self._contacts, self._before = (zeros(patches, dtype=contact_kernels.Contact) for _ in range(2))
-        self._pose, self._pressed = zeros(dtype=wp.mat44d), zeros(dtype=wp.int32)
-        self._pose.fill_(_NAN)
-        self._pressed.fill_(-1)
-        self._table, self._drags = zeros(patches, _COLUMNS, dtype=wp.float32), zeros(patches, dtype=fots_kernels.Drag)
-        self._most = wp.zeros(1, dtype=wp.int32, device=self.device)
-        self.displacement = zeros(len(rest), dtype=wp.vec2f)
+        self._pressed = wp.full(num_envs, value=-1, dtype=wp.int32, device=self.device)
+        self._drags = wp.zeros((num_envs, patches), dtype=drag, device=self.device)
+        self.displacement = wp.zeros((num_envs, len(rest)), dtype=wp.vec2f, device=self.device)
 
     def launch(
         self, height: wp.array, contact: wp.array, poses: wp.array, pad: int, depths: wp.array, sound: wp.array, shear: Any
@@ -93,38 +79,23 @@ class DeviceFots:
             sound: environments that have not broken down, (B,), bool; of the others it is kept which body was the object.
             shear: of the gels, the structure of a ``ShearState``.
         """
-        pool = [height, contact, self._pad, self._depth]
-        self._launch(contact_kernels.pool, self._depth.shape, pool)
-        detect = [self._depth, self._pad, self._parent, self._moments, self._box, self._contacts, self._most]
-        self._launch(contact_kernels.detect, len(self._box), detect)
-        state = [self._before, self._pose, self._pressed, self._table]
-        follow = [poses, pad, depths, sound, shear, self._pad, self._contacts, *state]
-        self._launch(contact_kernels.follow, len(self._box), follow)
-        self._launch(fots_kernels.limit, self._drags.shape, [self._table, self._constants, self._drags])
-        inputs = [self._xy, self._drags, self._box, self._depth, self._cells, self._constants, self.displacement]
-        self._launch(fots_kernels.displace, self.displacement.shape, inputs)
+        own = self.contacts
+        self._launch(pool, own.depth.shape, [height, contact, own.pad, own.depth])
+        chosen = [self._pressed, own.pose, own.centre, own.stretch]
+        self._launch(choose_object, len(self._pressed), [poses, pad, depths, sound, shear, *chosen])
+        own.launch()
+        self._launch(limit, self._drags.shape, [own.table, self._constants, self._drags])
+        inputs = [self._xy, self._drags, own.box, own.depth, self._cells, self._constants, self.displacement]
+        self._launch(displace, self.displacement.shape, inputs)
 
     def reset(self, mask: wp.array) -> None:
         """Forget the history of the environments of a mask (B,), bool, on the device."""
-        self._launch(contact_kernels.forget, len(self._box), [mask, self._before, self._pose, self._pressed])
+        self.contacts.reset(mask)
+        self._launch(forget_object, len(self._pressed), [mask, self._pressed])
 
     def check(self) -> None:
-        """Wait for the device. Raises ``InputError`` if a pad had more contacts than there is memory for."""
-        most = int(self._most.numpy()[0])
-        if most > self._room:
-            self._most.zero_()
-            raise InputError("patches", value=self._room, rule=f"must be {most} or more: contacts of a pad were lost")
+        """Wait for the device. Raises ``InputError`` if a pad had more contacts than memory."""
+        self.contacts.check()
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
-
-
-def _constants(motion: Any, config: Fots) -> Any:
-    result: Any = fots_kernels.Constants()
-    for name in ("dilate_gain", "dilate_lambda", "shear_lambda", "shear_max", "twist_lambda", "twist_max"):
-        setattr(result, name, getattr(motion, name))
-    punch = motion.punch if config.takes_punch else None
-    result.is_punch = int(punch is not None)
-    for name in ("anisotropy", "reach", "slip") if punch else ():
-        setattr(result, name, getattr(punch, name))
-    return result

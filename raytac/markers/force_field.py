@@ -21,7 +21,7 @@ from raytac.specs.marker_motion import MarkerMotionSpec
 
 
 def contact_at(rest: np.ndarray, surface: GelSurface, contacts: Contacts) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Penetration δ (B, M) [m], n_xy (B, M, 2) and the object's displacement s (B, M, 2) [m] at markers at ``rest`` (B, M, 3) [m]."""
+    """Penetration δ (B, M), n_xy and object's displacement (B, M, 2) [m] at ``rest`` (B, M, 3)."""
     height, slope, touched = height_and_slope(surface, rest[..., :2])
     depth = np.where(touched, np.maximum(rest[..., 2] - height, 0.0), 0.0)
     normal = slope / np.sqrt(1.0 + (slope**2).sum(axis=-1, keepdims=True))

@@ -1,4 +1,4 @@
-"""FOTS: markers pushed apart by the indentation, dragged by shear and turned by twist; computed on the device for all at once.
+"""FOTS: markers pushed apart by indentation, dragged by shear and turned by twist.
 
 Zhao, Qian, Duan and Luo, FOTS, RA-L 2024 (arXiv 2404.19217), in the form of the thesis behind TacEx, eq. 4.1 to 4.3. With a marker at M,
 contact points C_i of depth Δh_i and contacts c that the object has dragged by Δs_c and turned by Δθ_c:
@@ -12,20 +12,20 @@ drag. The dilation, whose contact points are where they are now, takes the marke
 published factor for one contact, and no more than one motion in all where contacts are close. a is the area of a sample, and g [1/m³] the
 gain that the published sum over pixels hides in its unit of length.
 
-With ``MarkerMotionSpec.punch`` shear and twist are those around a disc that sticks to a half-space (Johnson, Contact Mechanics, 1985, §3.6
-and 3.9; Reissner and Sagoci 1944), which fade with the pad's finite thickness. With x = M − G_c, x̂ its direction, A the disc's radius,
-r ≥ A its distance from G_c (``beyond_ellipse`` has both for an ellipse), t = A / r and g(t) = t √(1 − t²):
+With ``MarkerMotionSpec.punch`` shear and twist are those around a disc that sticks to a half-space (Johnson, Contact Mechanics, 1985,
+§3.6 and 3.9; Reissner and Sagoci 1944), which fade with the pad's finite thickness. With x = M − G_c, x̂ its direction, A the disc's
+radius, r ≥ A its distance from G_c (``beyond_ellipse`` has both for an ellipse), t = A / r and g(t) = t √(1 − t²):
 
     shear    Δd_s = (2/π) [(F asin t − κ g) Δs + 2 κ g x̂ (x̂ · Δs)]      e_c = (2/π) F asin t      F = exp(−(r − A) / ℓ)
     twist    Δd_t = (2/π) (asin t − g) (R(Δθ) − 1) x                   e_c = (2/π) (asin t − g)
 
-On a half-space of Poisson's ratio ν: κ = ν / (2 − ν) and ℓ = ∞. A base near by ends the motion that is alike in all directions, F, but not
-the rest, by which the skin ahead of the contact goes with it and that beside it comes back. t = 1 under the contact, where both are the
-object's own motion. A contact of mean indentation h̄ sticks up to Δs_max = c h̄ A, or up to Δθ_max = ``TWIST_SLIP`` c h̄. This is Coulomb's
-law: the force 8 G A Δs / (2 − ν) reaches μ P, with P = K h̄ π A² of a layer of foundation modulus K, so c = π μ K (2 − ν) / (8 G). Force F
-and couple M together stay on or within an ellipsoid, (F / F_max)² + (M / M_max)² = 1 (Howe and Cutkosky, Practical force-motion models for
-sliding manipulation, IJRR 15(6), 1996). Beyond it the contact slips along the ellipsoid's normal. F and M are linear in Δs and Δθ, so
-after slip these are
+On a half-space of Poisson's ratio ν: κ = ν / (2 − ν) and ℓ = ∞. A base near by ends the motion that is alike in all directions, F, but
+not the rest, by which the skin ahead of the contact goes with it and that beside it comes back. t = 1 under the contact, where both are
+the object's own motion. A contact of mean indentation h̄ sticks up to Δs_max = c h̄ A, or up to Δθ_max = ``TWIST_SLIP`` c h̄. This is
+Coulomb's law: the force 8 G A Δs / (2 − ν) reaches μ P, with P = K h̄ π A² of a layer of foundation modulus K, so c = π μ K (2 − ν) / (8
+G). Force F and couple M together stay on or within an ellipsoid, (F / F_max)² + (M / M_max)² = 1 (Howe and Cutkosky, Practical
+force-motion models for sliding manipulation, IJRR 15(6), 1996). Beyond it the contact slips along the ellipsoid's normal. F and M are
+linear in Δs and Δθ, so after slip these are
 
     Δs / (1 + γ), Δθ / (1 + b γ)      the least γ ≥ 0 that puts both within the ellipsoid      b = 1 / ``TWIST_SLIP``²
 
@@ -41,14 +41,11 @@ import warp as wp
 
 from raytac.device import resolve_device
 from raytac.gel.surface import GelSurface
-from raytac.markers.contacts import ContactCells, Contacts, ContactSamples
+from raytac.markers.contacts import COLUMNS, ContactCells, Contacts, ContactSamples
 from raytac.markers.fots_kernels import Cells, Constants, Drag, limit
 from raytac.markers.packet_kernels import PACKET, displace, packet
 from raytac.specs.marker_motion import MarkerMotionSpec
-from raytac.warp_runtime import start_warp
-
-_COLUMNS = 10
-"""Of ``Contacts.table`` that are read."""
+from raytac.warp_runtime import LAUNCH, start_warp
 
 
 class FotsModel:
@@ -71,10 +68,10 @@ class FotsModel:
 
 
 class FotsKernel:
-    """Marker displacements from contact samples and contacts; recorded once for each number of environments, markers and contacts."""
+    """Marker displacements from contact samples and contacts; recorded once a size."""
 
     def __init__(self, x: np.ndarray, y: np.ndarray, *, device: str = "auto") -> None:
-        """Prepare for samples at ``x`` (nx,), ``y`` (ny,) [m], evenly spaced; errors as of ``resolve_device``."""
+        """For samples at ``x`` (nx,), ``y`` (ny,) [m], even; errors as of ``resolve_device``."""
         self.device = resolve_device(device, ray_tracing=False)
         start_warp()
         self._samples = len(y), len(x)
@@ -92,7 +89,6 @@ class FotsKernel:
             markers: positions at rest [m], (B, M, 2) or (B, M, 3), of which x and y are read.
             depth: indentation of the samples [m], (B, ny, nx), 0 outside the contact.
             boxes, contacts: as ``ContactSamples.boxes`` and ``Contacts.table``, whose last two columns are not read.
-            motion: constants of the pad.
         """
         (batch, count), rows = markers.shape[:2], contacts.shape[1]
         size = batch, count, 1 << (rows - 1).bit_length()
@@ -105,13 +101,13 @@ class FotsKernel:
 
 
 class FotsArrays:
-    """Arrays on the device of B pads with M markers and K contacts each; ``moved`` (B, M) are the displacements [m]."""
+    """Device arrays of B pads, M markers, K contacts; ``moved`` (B, M): displacements [m]."""
 
     def __init__(self, size: tuple[int, int, int], samples: tuple[int, int], cells: Any, device: str) -> None:
         """For ``size`` (B, M, K) and ``samples`` (ny, nx) on a pad."""
         (batch, count, most), (ny, nx) = size, samples
         self._markers = wp.zeros((batch, count), dtype=wp.vec2f, device=device)
-        self._table = wp.zeros((batch, most, _COLUMNS), dtype=wp.float32, device=device)
+        self._table = wp.zeros((batch, most, COLUMNS), dtype=wp.float64, device=device)
         self._boxes = wp.zeros(batch, dtype=wp.vec4i, device=device)
         self._depth = wp.zeros((batch, ny, -(-nx // PACKET)), dtype=packet, device=device)
         self.moved = wp.zeros((batch, count), dtype=wp.vec2f, device=device)
@@ -139,7 +135,7 @@ class FotsArrays:
         """Copy arrays of the host, as of ``FotsKernel.displacement``, to the device."""
         xy, table, edges, samples = self._host
         xy[:] = markers[..., :2]
-        table[:, : contacts.shape[1]] = contacts[..., :_COLUMNS]
+        table[:, : contacts.shape[1], : contacts.shape[2]] = contacts
         table[:, contacts.shape[1] :] = 0.0
         edges[:] = boxes
         samples.reshape(*samples.shape[:2], -1)[..., : self._columns] = depth
@@ -150,15 +146,17 @@ class FotsArrays:
     def launch(self, motion: MarkerMotionSpec) -> None:
         """Compute ``moved`` with the constants of ``motion``."""
         if self._motion is not motion:
-            constants = _constants(motion)
+            constants = constants_of(motion)
             for recorded in self._launches:
                 recorded.set_param_by_name("motion", constants)
             self._motion = motion
-        for recorded in self._launches:
-            recorded.launch()
+        with LAUNCH:
+            for recorded in self._launches:
+                recorded.launch()
 
 
-def _constants(motion: MarkerMotionSpec) -> Any:
+def constants_of(motion: MarkerMotionSpec) -> Any:
+    """Constants of a marker motion, for kernels."""
     result: Any = Constants()
     for name in ("dilate_gain", "dilate_lambda", "shear_lambda", "shear_max", "twist_lambda", "twist_max"):
         setattr(result, name, getattr(motion, name))

@@ -1,4 +1,4 @@
-"""Kernels of ``DeviceFots``: shear and twist that each contact keeps, then the displacement of every marker, one thread each.
+"""Kernels of FOTS: what each contact keeps, and the markers' displacements.
 
 Formulas and sources are those of ``raytac.markers.fots``.
 """
@@ -14,15 +14,15 @@ import math
 
 import warp as wp
 
+from raytac.markers.contact_kernels import kept_shares
 from raytac.markers.contacts import TWIST_SLIP
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _TWIST_SLIP = wp.constant(wp.float32(TWIST_SLIP))
-_B = wp.constant(wp.float32(1.0 / TWIST_SLIP**2))
 _2_PI = wp.constant(wp.float32(2.0 / math.pi))
 _LIMIT_STEPS = 3
-"""Newton steps of ``kept_shares``: to float32's rounding at any shear and twist (a test compares with bisection)."""
+"""Newton steps of ``kept_shares``: to float32's rounding (a test compares bisection)."""
 _NEGLIGIBLE = wp.constant(wp.float32(16.0))
 """Exponent of a Gaussian beyond which it is neglected: float32 cannot add e⁻¹⁶ to 1."""
 
@@ -69,47 +69,36 @@ class Drag:
     """Of the disc with the ellipse's area [m]."""
 
 
-@wp.func
-def kept_shares(x: wp.float32, y: wp.float32) -> wp.vec2f:
-    """As ``raytac.markers.contacts.kept_shares``."""
-    gamma = wp.max(wp.max(x - 1.0, (y - 1.0) / _B), 0.0)
-    for _ in range(_LIMIT_STEPS):
-        p, q = 1.0 + gamma, 1.0 + _B * gamma
-        xp, yq = x / p, y / q
-        n = wp.sqrt(xp * xp + yq * yq)
-        gamma = gamma + n * n * wp.max(n - 1.0, 0.0) / wp.max(xp * xp / p + _B * yq * yq / q, 1e-12)
-    return wp.vec2f(1.0 / (1.0 + gamma), 1.0 / (1.0 + _B * gamma))
-
-
 @wp.kernel
-def limit(table: wp.array3d(dtype=wp.float32), motion: Constants, drags: wp.array2d(dtype=Drag)):
-    """Shear and twist that each contact (B, K) gives to the skin; ``table``: as ``Contacts.table``."""
+def limit(table: wp.array3d(dtype=wp.float64), motion: Constants, drags: wp.array2d(dtype=Drag)):
+    """Shear and twist that each contact (B, K) gives to the coat; see ``Contacts.table``."""
     b, k = wp.tid()
     m = motion
     drag = Drag()
-    drag.active = table[b, k, 0] + 0.0
-    shear, twist = wp.vec2f(table[b, k, 3], table[b, k, 4]), table[b, k, 5] + 0.0
+    drag.active = wp.float32(table[b, k, 0])
+    shear, twist = wp.vec2f(wp.float32(table[b, k, 3]), wp.float32(table[b, k, 4])), wp.float32(table[b, k, 5])
     length = wp.length(shear)
-    xx, xy, yy, depth = table[b, k, 6] + 0.0, table[b, k, 7] + 0.0, table[b, k, 8] + 0.0, table[b, k, 9] + 0.0
+    xx, xy, yy = wp.float32(table[b, k, 6]), wp.float32(table[b, k, 7]), wp.float32(table[b, k, 8])
+    depth = wp.float32(table[b, k, 9])
     drag.ellipse = wp.vec3f(xx, xy, yy)
     drag.radius = wp.sqrt(wp.sqrt(wp.max(xx * yy - xy * xy, 1e-24)))
     if m.is_punch == 1:
         shear_max, twist_max = m.slip * depth * drag.radius, _TWIST_SLIP * m.slip * depth
-        shares = kept_shares(length / wp.max(shear_max, 1e-12), wp.abs(twist) / wp.max(twist_max, 1e-12))
-        shear, twist = shares[0] * shear, shares[1] * twist
+        sheared, turned = kept_shares(length / wp.max(shear_max, 1e-12), wp.abs(twist) / wp.max(twist_max, 1e-12), _LIMIT_STEPS)
+        shear, twist = sheared * shear, turned * twist
     else:
         shear = shear * wp.min(1.0, m.shear_max / wp.max(length, 1e-12))
         twist = wp.clamp(twist, -m.twist_max, m.twist_max)
     half = wp.sin(0.5 * twist)
     drag.shear = shear
     drag.turn = wp.vec2f(-2.0 * half * half, wp.sin(twist))  # cos − 1 without cancellation
-    drag.centre = wp.vec2f(table[b, k, 1], table[b, k, 2]) - shear
+    drag.centre = wp.vec2f(wp.float32(table[b, k, 1]), wp.float32(table[b, k, 2])) - shear
     drags[b, k] = drag
 
 
 @wp.func
 def beyond_ellipse(x: wp.vec2f, t: wp.vec3f) -> wp.float32:
-    """r² − A² of a point ``x`` from the centre of the ellipse xᵀ T⁻¹ x = 1 with A² = √det T; 0 inside.
+    """r² − A² of a point ``x`` from the centre of xᵀ T⁻¹ x = 1, A² = √det T; 0 inside.
 
     The λ > 0 of the confocal ellipse xᵀ (T + λ)⁻¹ x = 1 through the point; these are the equipotentials of an elliptic disc, and
     λ = ‖x‖² − A² for a disc. λ² − b λ + c = 0 with b = ‖x‖² − tr T, c = det T − xᵀ adj(T) x.
@@ -163,23 +152,31 @@ def dragged(place: wp.vec2f, b: wp.int32, drags: wp.array2d(dtype=Drag), m: Cons
 
 @wp.func
 def first_cell(x: wp.float32, low: wp.int32, high: wp.int32) -> wp.int32:
-    """The first cell from ``low`` that is not before ``x``, in cells; ``high`` if there is none before it."""
+    """First cell from ``low`` that is not before ``x`` [cells]; at most ``high``."""
     return wp.int32(wp.clamp(wp.ceil(x), wp.float32(low), wp.float32(high)))
+
+
+@wp.func
+def within_reach(place: wp.vec2f, box: wp.vec4i, cells: Cells, lam: wp.float32):
+    """Place of a marker [cells]; columns from, to and rows from, to of the box within its reach."""
+    reach = wp.sqrt(_NEGLIGIBLE / lam)
+    dx, dy = cells.pitch[0], cells.pitch[1]
+    at_x, at_y = (place[0] - cells.origin[0]) / dx, (place[1] - cells.origin[1]) / dy
+    c0, c1 = first_cell(at_x - reach / dx, box[0], box[1]), first_cell(at_x + reach / dx, box[0], box[1])
+    r0, r1 = first_cell(at_y - reach / dy, box[2], box[3]), first_cell(at_y + reach / dy, box[2], box[3])
+    return at_x, at_y, c0, c1, r0, r1
 
 
 @wp.func
 def dilated(
     place: wp.vec2f, b: wp.int32, box: wp.vec4i, depth: wp.array3d(dtype=wp.float32), cells: Cells, lam: wp.float32
 ) -> wp.vec2f:
-    """Σ Δh (M − C) exp(−λ ‖M − C‖²) over the cells of the contact's box that lie within reach of the marker.
+    """Σ Δh (M − C) exp(−λ ‖M − C‖²) over cells of the contact's box within a marker's reach.
 
     ``box``: columns from, to and rows from, to; a cell that nothing touches has a negative depth.
     """
-    reach = wp.sqrt(_NEGLIGIBLE / lam)
     dx, dy = cells.pitch[0], cells.pitch[1]
-    at_x, at_y = (place[0] - cells.origin[0]) / dx, (place[1] - cells.origin[1]) / dy
-    c0, c1 = first_cell(at_x - reach / dx, box[0], box[1]), first_cell(at_x + reach / dx, box[0], box[1])
-    r0, r1 = first_cell(at_y - reach / dy, box[2], box[3]), first_cell(at_y + reach / dy, box[2], box[3])
+    at_x, at_y, c0, c1, r0, r1 = within_reach(place, box, cells, lam)
     x, y = wp.float32(0.0), wp.float32(0.0)
     for r in range(r0, r1):
         ey = (at_y - wp.float32(r)) * dy

@@ -1,5 +1,6 @@
-"""Kernel of ``FotsKernel``: displacements of markers, one thread each, by whole packets of a row of samples.
+"""Kernel of ``FotsKernel``: displacements by packets of a row of samples.
 
+One thread computes one marker.
 A processor has vector registers for packets, and the Gaussians of a row are computed once for all of its samples.
 """
 
@@ -12,15 +13,13 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.markers.fots_kernels import Cells, Constants, Drag, dragged, first_cell
+from raytac.markers.fots_kernels import Cells, Constants, Drag, dragged, within_reach
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 PACKET = 16
-"""Samples of a row that are summed side by side: as many as a vector register of common processors holds."""
+"""Samples of a row that are summed together: as many as a vector register holds."""
 packet = wp.types.vector(length=PACKET, dtype=wp.float32)
-_NEGLIGIBLE = wp.constant(wp.float32(16.0))
-"""Exponent of a Gaussian beyond which it is neglected: float32 cannot add e⁻¹⁶ to 1."""
 
 
 @wp.func
@@ -34,16 +33,13 @@ def dilated(
     lam: wp.float32,
     weights: wp.array3d(dtype=wp.vec2f),
 ) -> wp.vec2f:
-    """Σ Δh (M − C) exp(−λ ‖M − C‖²) over the samples of the contact's box that lie within reach of the marker.
+    """Σ Δh (M − C) exp(−λ ‖M − C‖²) over samples of the contact's box within a marker's reach.
 
     ``box``: columns from, to and rows from, to. Samples beyond the box are 0, so whole packets are read. From one sample to the next a
     Gaussian changes by a factor, and that by a constant one; in double precision this keeps float32's over a whole pad.
     """
-    reach = wp.sqrt(_NEGLIGIBLE / lam)
     dx, dy = cells.pitch[0], cells.pitch[1]
-    at_x, at_y = (place[0] - cells.origin[0]) / dx, (place[1] - cells.origin[1]) / dy
-    c0, c1 = first_cell(at_x - reach / dx, box[0], box[1]), first_cell(at_x + reach / dx, box[0], box[1])
-    r0, r1 = first_cell(at_y - reach / dy, box[2], box[3]), first_cell(at_y + reach / dy, box[2], box[3])
+    at_x, at_y, c0, c1, r0, r1 = within_reach(place, box, cells, lam)
     sx, sy = packet(), packet()
     if c0 < c1 and r0 < r1:
         p0, p1 = c0 // PACKET, (c1 - 1) // PACKET + 1
@@ -90,7 +86,7 @@ def displace(
     weights: wp.array3d(dtype=wp.vec2f),
     moved: wp.array2d(dtype=wp.vec2f),
 ):
-    """Displacements (B, M) [m] of markers at ``xy`` at rest; ``weights`` (B, M, ny) are working memory."""
+    """Displacements (B, M) [m] of markers at ``xy``; ``weights`` (B, M, ny): working memory."""
     b, i = wp.tid()
     box = boxes[b]
     m = motion

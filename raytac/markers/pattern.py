@@ -1,4 +1,4 @@
-"""Dots on the coat: their positions at rest, which the camera must see, and the ink that they print on the surface."""
+"""Dots on the coat: positions at rest, which the camera must see, and printed ink."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from raytac.specs.sensor import MarkerSpec, SensorSpec
 
 
 def marker_centres(spec: MarkerSpec) -> np.ndarray:
-    """x, y of the dots at rest [m], pad frame, shape (M, 2), row by row: dot (j, i) of ``rows`` and ``columns`` is j · columns + i."""
+    """x, y of the dots at rest [m], pad frame, (M, 2); dot (j, i) is j · columns + i."""
     x = spec.offset[0] + (np.arange(spec.columns) - 0.5 * (spec.columns - 1)) * spec.pitch[0]
     y = spec.offset[1] + (np.arange(spec.rows) - 0.5 * (spec.rows - 1)) * spec.pitch[1]
     return np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1).reshape(-1, 2)
 
 
 def camera_of(sensor: SensorSpec, resolution: tuple[int, int] | None = None) -> Pinhole:
-    """The camera that makes the sensor's images, at ``resolution`` (width, height) [px]; None is the sensor's own."""
+    """Camera of the sensor at ``resolution`` (width, height) [px]; None is the sensor's own."""
     if sensor.refraction.model == "none":
         return Pinhole.from_spec(sensor.camera, resolution)
     from raytac.optics.refraction import Slab
@@ -49,7 +49,11 @@ class MarkerPattern:
         shift: np.ndarray | None = None,
         turn: np.ndarray | None = None,
     ) -> MarkerPattern:
-        """Place the sensor's dots, turned by ``turn`` (B,) [rad] about the pad's centre, then moved by ``shift`` (B, 2) [m].
+        """Place the sensor's dots, turned about the pad's centre, then shifted.
+
+        Args:
+            shift: (B, 2) [m].
+            turn: (B,) [rad].
 
         Raises:
             InputError: the sensor has no markers, or a shift takes one off the pad or out of the view.
@@ -90,7 +94,7 @@ class MarkerPattern:
         return self.rest.shape[1]
 
     def for_batch(self, batch: int) -> np.ndarray:
-        """``rest`` for ``batch`` environments, (B, M, 3); ``InputError`` if it was shifted for another number."""
+        """``rest`` of ``batch`` environments, (B, M, 3); InputError if shifted for another number."""
         if len(self.rest) not in (1, batch):
             raise InputError("batch", value=batch, rule=f"the pattern was placed for {len(self.rest)} environments")
         return np.broadcast_to(self.rest, (batch, *self.rest.shape[1:]))
@@ -103,30 +107,10 @@ def dot_ink(grid: PadGrid, centres: np.ndarray, radius: float) -> np.ndarray:
     it is neglected. Its edge is one grid spacing wide, so that images interpolate it without steps. Centres that are not finite print no
     dot.
     """
-    dx, dy = grid.pitch
-    ny, nx = grid.shape
-    batch = len(centres)
-    ink = np.zeros((batch, ny, nx), dtype=np.float32)
-    env, marker = np.nonzero(np.isfinite(centres[..., :2]).all(axis=-1))
-    x, y = centres[env, marker, 0], centres[env, marker, 1]
-    kx, ky = int(np.ceil(radius / dx)) + 1, int(np.ceil(radius / dy)) + 1
-    column, row = np.rint((x - grid.x[0]) / dx).astype(int), np.rint((y - grid.y[0]) / dy).astype(int)
-    columns, rows = column[:, None] + np.arange(-kx, kx + 1), row[:, None] + np.arange(-ky, ky + 1)
-    # Single precision is enough for distances within a dot.
-    ex = (grid.x[0] + columns * dx - x[:, None]).astype(np.float32)
-    ey = (grid.y[0] + rows * dy - y[:, None]).astype(np.float32)
-    share = np.sqrt((ex * ex)[:, None, :] + (ey * ey)[:, :, None])
-    share *= np.float32(-1.0 / max(dx, dy))
-    share += np.float32(radius / max(dx, dy) + 0.5)
-    np.minimum(np.maximum(share, 0.0, out=share), 1.0, out=share)
-    node = ((env * ny)[:, None] + rows)[:, :, None] * nx + columns[:, None, :]
-    if len(env) and (rows.min() < 0 or rows.max() >= ny or columns.min() < 0 or columns.max() >= nx):
-        on_pad = ((rows >= 0) & (rows < ny))[:, :, None] & ((columns >= 0) & (columns < nx))[:, None, :]
-        node, share = node[on_pad], share[on_pad]
-    node, share, flat = node.reshape(-1), share.reshape(-1), ink.reshape(-1)
-    # The greatest share of each node. Dots seldom overlap, so one round is enough, in a tenth of the time of ``np.maximum.at``.
-    while len(node):
-        flat[node] = share
-        more = share > flat[node]
-        node, share = node[more], share[more]
-    return ink
+    import warp as wp
+
+    from raytac.markers.ink_kernels import DeviceInk
+
+    at = np.ascontiguousarray(centres[..., :2], float)
+    dots = DeviceInk(grid, radius, num_envs=len(at))
+    return dots(wp.array(at, dtype=wp.vec2d, device="cpu", copy=False)).numpy()

@@ -1,4 +1,4 @@
-"""Perturbations of a real marker tracker: noise of detected centres, lost dots, and a gel that is mounted with an offset; all seeded."""
+"""Seeded perturbations of a marker tracker: noise, lost dots, a gel mounted with an offset."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class MarkerPerturbation:
     dropout: float = 0.0
     """Probability that a marker is lost in a frame, in [0, 1)."""
     shift: float = 0.0
-    """Largest shift of the pattern along x and y [m]; uniform, drawn at every reset of an environment."""
+    """Largest shift of the pattern along x and y [m]; uniform, drawn at every reset."""
     turn: float = 0.0
-    """Largest rotation of the pattern about the pad's centre [rad]; uniform, drawn with the shift."""
+    """Largest rotation of the pattern about the pad's centre [rad]; drawn with the shift."""
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -40,14 +40,14 @@ class MarkerPerturbation:
 
 
 class Perturber:
-    """Random streams, one for each environment, so that its draws do not depend on the number of environments."""
+    """Random streams, one an environment: its draws do not depend on their number."""
 
     def __init__(self, settings: MarkerPerturbation, seed: int, batch: int) -> None:
         self.settings = settings
         self._streams = [np.random.default_rng((seed, env)) for env in range(batch)]
 
     def reseed(self, env: int, seed: int) -> None:
-        """Restart the stream of an environment, as that of environment 0 of a perturber with this seed."""
+        """Restart the stream of an environment, as that of environment 0 with this seed."""
         self._streams[env] = np.random.default_rng((seed, 0))
 
     def placement(self, env: int) -> tuple[np.ndarray, float]:
@@ -56,7 +56,7 @@ class Perturber:
         return self.settings.shift * draw[:2], float(self.settings.turn * draw[2])
 
     def noise(self, count: int, envs: Sequence[int] | None = None) -> np.ndarray | None:
-        """Errors of the detected centres [px], (n, M, 2), of environments, all if None; None without noise."""
+        """Errors of centres [px], (n, M, 2), of ``envs`` (None: all); None without noise."""
         if self.settings.noise_px == 0:
             return None
         return self.settings.noise_px * self._drawn(lambda stream: stream.standard_normal((count, 2)), envs)

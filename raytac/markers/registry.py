@@ -30,5 +30,5 @@ def markers_config(markers: str | MarkersConfig) -> MarkersConfig:
 
 
 def models_without_coat() -> tuple[str, ...]:
-    """Names of the models that work with every physics; they are the ones that are compared with surface tracking."""
+    """Names of models for every physics, which are compared with surface tracking."""
     return tuple(name for name in MARKERS.names if not MARKERS.config_class(name).needs_coat)

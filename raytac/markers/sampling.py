@@ -1,4 +1,4 @@
-"""The surface and the object at the markers: height, slope, contact, and the object's displacement since first touch."""
+"""Surface and object at the markers: height, slope, contact, displacement."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from raytac.markers.contacts import Contacts
 
 
 def _cells(surface: GelSurface, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Flat index in ``height`` of the first node of each point's cell, and its place in the cell along x and y, each (B, M).
+    """First node of each point's cell as a flat index, and its place in the cell, (B, M).
 
     Points beyond the pad are moved to its edge.
     """
@@ -38,7 +38,7 @@ def height_at(surface: GelSurface, xy: np.ndarray) -> np.ndarray:
 
 
 def height_and_slope(surface: GelSurface, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """z [m] (B, M), its gradient along x, y [-] (B, M, 2) and contact of the nearest node (B, M) at points (B, M, 2) [m]."""
+    """z [m] (B, M), gradient (B, M, 2), contact of the nearest node (B, M), at (B, M, 2) [m]."""
     slopes = []
     for axis, pitch in enumerate(surface.grid.pitch):
         half = np.zeros(2)
@@ -51,8 +51,9 @@ def height_and_slope(surface: GelSurface, xy: np.ndarray) -> tuple[np.ndarray, n
 
 
 def object_displacement(contacts: Contacts, xy: np.ndarray) -> np.ndarray:
-    """Tangential displacement since first touch [m], (B, M, 2), of the object at points ``xy`` (B, M, 2) [m].
+    """Displacement (B, M, 2) [m] of the object at points ``xy`` (B, M, 2) [m].
 
+    It is tangential, since first touch.
     That of the nearest contact, as a rigid body: Δs + (R(Δθ) − 1)(M − G). 0 in an environment without contact.
     """
     x = xy[:, :, None] - contacts.centre[:, None]

@@ -1,4 +1,4 @@
-"""Superposition: the pad's linear response to the loads that hold the contact where the object has put it.
+"""Superposition: the pad's linear response to loads that keep the contact in its place.
 
 Taxim (Si and Yuan, RA-L 2022) adds up displacement fields of unit loads, from a finite-element model, with the weights that
 give the contact its known displacement. Here the fields are those of the soft pad's own tetrahedra at rest, by its linear stiffness with
@@ -8,8 +8,8 @@ vertices and A those in contact:
     C_AA f = u_A,    u = C_·A f,
 
 u_A: down to the object along z, along x and y with the object since first touch. A vertex that the object would have to pull is released.
-One that would need more than Coulomb's μ |f_z| to stick slides: it keeps only its z, and f_xy = μ |f_z| in the direction of its last load.
-Each time the system is solved again.
+One that would need more than Coulomb's μ |f_z| to stick slides: it keeps only its z, and f_xy = μ |f_z| in the direction of its last
+load. Each time the system is solved again.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class SuperpositionModel:
         return self._points.interpolate(self.coat, rest, moved[..., :2])
 
     def _superpose(self, prescribed: np.ndarray, in_contact: np.ndarray) -> np.ndarray:
-        """Displacement of all vertices (V, 3) that gives those ``in_contact`` (V,) their ``prescribed`` displacement (V, 3)."""
+        """Displacement of all vertices (V, 3) with ``prescribed`` (V, 3) at those ``in_contact``."""
         sticking, slides = in_contact.copy(), np.zeros(len(in_contact), bool)
         direction = np.zeros((len(in_contact), 2))
         """Direction of the friction on a sliding vertex."""
@@ -80,7 +80,7 @@ class SuperpositionModel:
         return (self._compliance[:, dof] @ load.ravel()).reshape(-1, 3)
 
     def _load(self, dof: np.ndarray, prescribed: np.ndarray, slides: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Loads [N] (A, 3) on the vertices of ``dof`` (3 A) that give them their ``prescribed`` displacement, or friction that slides."""
+        """Loads [N] (A, 3) on ``dof`` (3 A): displacements as ``prescribed``, or sliding friction."""
         matrix, right = self._compliance[np.ix_(dof, dof)].astype(float), prescribed.copy()
         # The unit of these rows is that of the others, so that the matrix stays well-conditioned.
         unit = float(np.trace(matrix)) / len(dof)
@@ -94,13 +94,13 @@ class SuperpositionModel:
 
 
 def coat_compliance(mesh: PadMesh, gelpad: GelpadSpec) -> np.ndarray:
-    """Displacement of the coat's vertices by unit loads on them [m/N], shape (3V, 3V); degree of freedom 3 v + axis."""
+    """Displacement of the coat's vertices by unit loads [m/N], (3V, 3V), at 3 v + axis."""
     count = 3 * len(mesh.coat_vertices)
     return mesh_compliance.coat_compliance(mesh, gelpad, along=(0, 1, 2)).transpose(2, 1, 3, 0).reshape(count, count)
 
 
 def cached_compliance(mesh: PadMesh, gelpad: GelpadSpec) -> np.ndarray:
-    """``coat_compliance``, float32, from the user's cache if it was made before; one that is damaged is made again, with a warning."""
+    """``coat_compliance``, float32, from the user's cache; warns where that is damaged."""
     arrays = mesh.tets.vertices, mesh.tets.tets, mesh.bonded, mesh.coat_vertices
     basis = repr(gelpad), *(array.tobytes() for array in arrays), code_digest(__name__, mesh_compliance.__name__)
     digest = hashlib.sha256(repr(basis).encode()).hexdigest()[:24]

@@ -1,4 +1,4 @@
-"""Surface tracking: every marker is a point of the soft pad's coat, which moves with the triangle that it lies in.
+"""Surface tracking: a marker moves with the triangle of the coat that it lies in.
 
 As in Chen et al. (T-RO 2024) and TacIPC (Du et al., RA-L 2024): barycentric coordinates at rest, kept for ever.
 """
@@ -20,7 +20,7 @@ class CoatPoints:
         self._bound: tuple[CoatMesh, np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def interpolate(self, mesh: CoatMesh, rest: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Values of the mesh's vertices (B, V, n) at the markers at ``rest`` (B, M, 3) [m], shape (B, M, n)."""
+        """Values of vertices (B, V, n) at the markers at ``rest`` (B, M, 3) [m], (B, M, n)."""
         pattern = rest[:1] if rest.strides[0] == 0 else rest
         if self._bound is None or self._bound[0] is not mesh or not np.array_equal(self._bound[1], pattern):
             self._bound = mesh, np.array(pattern), *bind_to_coat(mesh, pattern[..., :2])
@@ -43,8 +43,7 @@ class SurfaceModel:
     ) -> np.ndarray:
         """Displacement along x, y and z [m], shape (B, M, 3), of markers at ``rest`` (B, M, 3).
 
-        Raises:
-            InputError: the surface has no coat mesh, or a marker lies off it.
+        Raises ``InputError``: the surface has no coat mesh, or a marker lies off it.
         """
         if surface.coat is None:
             rule = "needs a soft pad (physics='ipc'): a rigid pad has heights only; choose another model, such as fots"

@@ -1,4 +1,4 @@
-"""``MarkerTracker``: marker displacements from surfaces, in metres on the pad and in pixels of the image."""
+"""``MarkerTracker``: marker displacements from surfaces, in metres and pixels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from raytac.errors import InputError
 from raytac.gel.contact_shear import ContactShear
 from raytac.gel.surface import GelSurface, PadGrid, chosen_envs, summary
 from raytac.markers.base import MarkersConfig
-from raytac.markers.contacts import ContactCells, ContactTracker
+from raytac.markers.contact_tracker import ContactTracker
+from raytac.markers.contacts import ContactCells
 from raytac.markers.pattern import MarkerPattern
 from raytac.markers.perturbation import MarkerPerturbation, Perturber
 from raytac.markers.registry import markers_config
@@ -26,15 +27,15 @@ class MarkerFrame:
     """Markers of B pads at one instant, M each, row by row of the pattern."""
 
     displacement: np.ndarray
-    """Displacement along x, y of the pad frame [m], shape (B, M, 2); NaN for a marker that is lost or an environment that failed."""
+    """Displacement along x, y of the pad frame [m], (B, M, 2); NaN where lost or failed."""
     displacement_px: np.ndarray
-    """Displacement along u, v of the image [px], shape (B, M, 2), with the perspective of a motion along z; NaN likewise."""
+    """Displacement along u, v of the image [px], (B, M, 2), with perspective; NaN likewise."""
     rest: np.ndarray
     """Positions at rest, pad frame [m], shape (B, M, 3)."""
     rest_px: np.ndarray
     """Positions at rest in the image [px], shape (B, M, 2)."""
     position: np.ndarray
-    """Positions now, pad frame [m], shape (B, M, 3), without noise or losses; the dots of the image lie there."""
+    """Positions now, pad frame [m], (B, M, 3), without noise or losses; the image's dots."""
     visible: np.ndarray
     """True for markers that the tracker detects, shape (B, M), bool."""
 
@@ -48,7 +49,7 @@ class MarkerFrame:
 
 
 class _LazyFrame(MarkerFrame):
-    """Markers whose place in space and in the image is computed when it is first asked for: a learner often sees neither."""
+    """Markers whose place in space and image, which learners seldom see, is computed if asked."""
 
     def __init__(
         self,
@@ -108,7 +109,6 @@ class MarkerTracker:
             grid: grid of the surfaces to come, of ``num_envs`` environments.
             resolution: (width, height) of the image that pixels refer to [px]; None is the sensor's own.
             device: ``auto``, ``cpu`` or ``cuda``, for models that can use it.
-            seed: seed of the perturbation.
 
         Raises:
             InputError: an unknown model, a sensor without markers or without the marker motion that the model needs, or a shift that
@@ -144,18 +144,18 @@ class MarkerTracker:
         """z of the grid's rest surface at the pattern [m], (1 or B, M)."""
 
     def reset(self, envs: np.ndarray | list[int] | None = None) -> None:
-        """Restart environments, as in ``chosen_envs``: no history of contact, a new placement of the pattern."""
+        """Restart environments, as in ``chosen_envs``: no history, a new placement."""
         which = chosen_envs(envs, self.num_envs)
         self._contacts.reset(which)
         self._place(which)
 
     def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
-        """Restart the perturbations of environments, each from a seed; ``reset`` then draws from them."""
+        """Restart perturbations, each from a seed; ``reset`` then draws from them."""
         for b, seed in zip(envs, seeds, strict=True):
             self._perturber.reseed(b, seed)
 
     def at_rest(self, envs: Sequence[int] = (0,)) -> MarkerFrame:
-        """Markers of untouched pads, placed as in environments ``envs``; changes no history and draws nothing."""
+        """Markers of untouched pads, placed as in ``envs``; changes and draws nothing."""
         rest, pixel = self._rest[list(envs)], self._pixel[list(envs)]
         zero = np.zeros(pixel.shape)
         return MarkerFrame(zero, zero, rest, pixel, rest, np.ones(pixel.shape[:2], bool))
@@ -172,8 +172,7 @@ class MarkerTracker:
         twice advances and draws once. ``shear``: of the gel in one contact of each row, where the physics knows it; models that follow it
         (``MarkersConfig.follows_shear``) then need no earlier surface for that contact.
 
-        Raises:
-            InputError: a surface of another number of environments or another grid, or one that lacks what the model needs.
+        Raises ``InputError``: a surface of another number of environments or another grid, or one that lacks what the model needs.
         """
         count = self.num_envs if envs is None else len(envs)
         if surface.batch != count:

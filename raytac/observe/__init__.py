@@ -1,4 +1,4 @@
-"""Observations for a learner from frames of a sensor: spaces, batched arrays, stacks, randomisation. Gymnasium is not needed."""
+"""Observations for a learner from sensor frames, batched; Gymnasium is not needed."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Observed images of many pads that stay on the device, for a solver and a learner on the same device."""
+"""Observed images of many pads, for a solver and a learner on one device."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ from typing import Any
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface
+from raytac.markers.pattern import MarkerPattern, dot_ink
 from raytac.observe.observer import TactileObserver
 from raytac.sensor import TactileSensor
 
 
 class DeviceImages:
-    """The ``rgb`` of a ``TactileObserver``, from heights on the device to an image on the device.
+    """The ``rgb`` of a ``TactileObserver``, from heights on a device to images on it.
 
     .. code-block:: python
 
@@ -48,20 +49,24 @@ class DeviceImages:
             raise InputError("randomization", value=observer.randomization, rule="must not change images on the device")
         cut = ImageCut(layout.observed, layout.crop_x, layout.crop_y, layout.downscale)
         self.grid = sensor.grid
-        self._image = DeviceImage(sensor.optical_mode, sensor.grid, cut, difference=settings.difference)
+        ink = None
+        if sensor.markers is not None:
+            ink = dot_ink(sensor.grid, MarkerPattern.of(sensor.spec).rest, sensor.spec.markers.radius)
+        self._image = DeviceImage(sensor.optical_mode, sensor.grid, cut, difference=settings.difference, ink=ink)
 
     def upload(self, surface: GelSurface) -> tuple[Any, Any]:
         """Heights and contact of B surfaces as arrays on the device, for ``observe``."""
         return self._image.upload(surface)
 
-    def observe(self, heights: Any, contact: Any = None) -> dict[str, Any]:
-        """``rgb`` (B, height, width, 3), uint8, on the device; ``as_tensors`` makes it a PyTorch tensor without a copy.
+    def observe(self, heights: Any, contact: Any = None, ink: Any = None) -> dict[str, Any]:
+        """``rgb`` (B, height, width, 3), uint8, on the device; ``as_tensors`` copies nothing.
 
         Args:
             heights: [m], B·Ny·Nx of them on the device, finite, which is not checked: a Dr.Jit array or a float32 PyTorch tensor.
             contact: 1 where the object touches, else 0, as many bytes; only for optical modes that need it.
+            ink: share of marker dots at the nodes, as many numbers in [0, 1]; None shows none.
 
         Raises:
             InputError: no whole number of grids, a batch too large for the memory, or contact missing.
         """
-        return {"rgb": self._image(heights, contact)}
+        return {"rgb": self._image(heights, contact, ink)}

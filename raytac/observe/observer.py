@@ -65,9 +65,7 @@ class TactileObserver:
         Args:
             sensor: name of a shipped sensor, path of a sensor file, or a specification.
             settings: choices of the observation; None is the markers.
-            num_envs: number of environments B.
             randomization: differences between environments and worlds; None is none.
-            seed: of every draw.
 
         Raises:
             InputError: markers of a sensor without, an image too large, a number out of range, or a perturbation of markers that
@@ -106,9 +104,9 @@ class TactileObserver:
         return replace(config, perturbation=drawn)
 
     def sensor_options(self) -> dict[str, Any]:
-        """Keyword arguments of a ``TactileSensor`` with the outputs observed, without the sensor and the physics.
+        """Keyword arguments of a ``TactileSensor`` with the outputs observed.
 
-        Of images only the crop that is observed is rendered.
+        Sensor and physics are not among them. Of images only the observed crop is rendered.
         """
         settings, optics = self.settings, chosen_optics(self.settings.optics)
         if self.layout.crop is not None and not isinstance(optics, BuiltOptics):
@@ -123,7 +121,7 @@ class TactileObserver:
         }
 
     def make_sensor(self, **options: Any) -> TactileSensor:
-        """Make a sensor with the outputs observed; ``options`` of ``TactileSensor`` override those of the settings."""
+        """Make a sensor with the outputs observed; ``options`` override those of the settings."""
         return TactileSensor(self.sensor, **{**self.sensor_options(), **options})
 
     def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
@@ -132,7 +130,10 @@ class TactileObserver:
             self._drift.reseed(envs, seeds)
 
     def reset(self, envs: np.ndarray | Sequence[int] | None = None) -> None:
-        """Begin episodes in environments (a mask (B,), a list, or None for all): empty the stacks and draw the cameras again.
+        """Begin episodes: empty the stacks and draw the cameras again.
+
+        Args:
+            envs: mask (B,) or list of environments; None for all.
 
         Raises:
             InputError: an environment that does not exist.
@@ -167,11 +168,10 @@ class TactileObserver:
         return self._finished(values, frame.failed, rows)
 
     def observe_wrench(self, wrench: np.ndarray, failed: np.ndarray, envs: np.ndarray) -> dict[str, np.ndarray]:
-        """As ``observe``, from wrenches of the world, where only the ``wrench`` is observed and no surface is needed.
+        """Observe the ``wrench`` alone, from wrenches of the world; no surface is needed.
 
         Args:
             wrench: wrenches of all environments (B, 6).
-            failed: environments that have failed (B,), bool.
             envs: mask (B,) of environments with new wrenches; the others keep their last observation.
 
         Raises:
@@ -216,6 +216,8 @@ class TactileObserver:
                 return self._scaled(name, self._map(frame, frame.surface.height))
             case "indentation":
                 return self._scaled(name, self._map(frame, frame.surface.indentation))
+            case "traction":
+                return self._scaled(name, self._map(frame, frame.traction))
             case "wrench":
                 return self._scaled(name, frame.wrench)
         raise AssertionError(name)  # the settings know the names
@@ -231,7 +233,7 @@ class TactileObserver:
         return ((255 + images.astype(np.int16) - self._rest[rows]) // 2).astype(np.uint8)
 
     def _take_rest(self, sensor: TactileSensor | None, rows: np.ndarray) -> None:
-        """Render the pads of ``rows`` at rest with their present cameras, if they were reset since the last time."""
+        """Render pads at rest with their present cameras, where ``rows`` were reset."""
         stale = np.unique(rows[self._stale_rest[rows]])
         if not len(stale):
             return
@@ -306,7 +308,7 @@ class TactileObserver:
 
 
 class CellMeans:
-    """Means over (rows, columns) cells of values at nodes (B, Ny, Nx); a node belongs to the cell that contains it."""
+    """Means over (rows, columns) cells of values at nodes (B, Ny, Nx, …), each in one cell."""
 
     def __init__(self, nodes: tuple[int, int], cells: tuple[int, int]) -> None:
         """Raises ``InputError`` if there are more cells than nodes."""
@@ -318,7 +320,15 @@ class CellMeans:
         self._counts = [np.diff(np.append(s, n)) for s, n in zip(self._starts, nodes, strict=True)]
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Means (B, rows, columns), float64."""
+        """Means (B, rows, columns, …), float64."""
         summed = np.add.reduceat(values, self._starts[0], axis=1, dtype=float)
         summed = np.add.reduceat(summed, self._starts[1], axis=2)
-        return summed / (self._counts[0][:, None] * self._counts[1])
+        counts = self._counts[0][:, None] * self._counts[1]
+        return summed / counts.reshape(*counts.shape, *(1 for _ in values.shape[3:]))
+
+    def matrices(self) -> tuple[np.ndarray, np.ndarray]:
+        """Matrices P (rows, Ny) and Q (Nx, columns) with which the means are P v Q."""
+        p, q = (
+            (np.repeat(np.arange(len(count)), count) == np.arange(len(count))[:, None]) / count[:, None] for count in self._counts
+        )
+        return p, q.T

@@ -1,11 +1,13 @@
-"""Seeded differences between nominally equal sensors, drawn for each environment or once for a world."""
+"""Seeded differences between nominally equal sensors, for each environment or for a world."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
+from array_api_compat import array_namespace, device
 
 from raytac.checks import is_number
 from raytac.errors import InputError
@@ -14,7 +16,7 @@ from raytac.specs.sensor import SensorSpec
 from raytac.specs.task import TaskScene
 
 _ABSOLUTE = {"noise": np.inf, "pad_shift": 0.02, "pad_turn": 0.5}
-"""Widths that are not relative to 1, and their upper bounds: a larger one is no mounting error."""
+"""Upper bounds of widths that are not relative to 1: a larger one is no mounting error."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +44,11 @@ class Randomization:
     body_mass: float = 0.0
     """Mass of each free body."""
     body_friction: float = 0.0
-    """Friction coefficient of each body that has one in the scene, against gel and all else alike. For two bodies in contact MuJoCo uses
-    the greater coefficient."""
+    """Friction coefficient of each body that has one in the scene, against all it touches.
+
+    For two bodies in contact MuJoCo uses the greater coefficient."""
     pad_shift: float = 0.0
-    """Shift of each pad on its mount, along each axis of the pad frame [m]; the arm's control ignores it."""
+    """Shift of each pad on its mount along each pad axis [m]; the arm's control ignores it."""
     pad_turn: float = 0.0
     """Rotation of each pad on its mount: each component of a rotation vector, pad frame [rad]."""
     exposure: float = 0.0
@@ -100,7 +103,7 @@ class Randomization:
 
 
 def randomised_sensor(sensor: SensorSpec, randomization: Randomization, seed: int) -> SensorSpec:
-    """Sensor drawn by a seed; the same sensor if nothing of it varies. A reflectance is at most 1."""
+    """Sensor drawn by a seed, the same if nothing of it varies; reflectances are at most 1."""
     r = randomization
     if not r.changes_sensor:
         return sensor
@@ -119,7 +122,7 @@ def randomised_sensor(sensor: SensorSpec, randomization: Randomization, seed: in
 
 
 def randomised_bodies(scene: TaskScene, randomization: Randomization, seed: int) -> TaskScene:
-    """Scene with bodies drawn by a seed, equal in all environments; the same scene if none varies."""
+    """Scene with bodies drawn by a seed, equal in all environments; the same if none varies."""
     r = randomization
     if not r.changes_bodies:
         return scene
@@ -134,6 +137,20 @@ def randomised_bodies(scene: TaskScene, randomization: Randomization, seed: int)
         body = replace(body, **{name: float(value * friction) for name, value in coefficients.items() if value is not None})
         bodies.append(body)
     return replace(scene, bodies=tuple(bodies))
+
+
+def response_curves(draws: Any, randomization: Randomization, gamma: float) -> Any:
+    """8-bit values of n cameras by the nominal one's, (n, 3, 256); NumPy or PyTorch.
+
+    Args:
+        draws: uniform random numbers (n, 5) in [−1, 1): exposure, white balance of three channels, exponent.
+        gamma: exponent of the nominal camera.
+    """
+    xp, r = array_namespace(draws), randomization
+    gain = (1.0 + r.exposure * draws[:, :1]) * (1.0 + r.white_balance * draws[:, 1:4])
+    exponent = gamma * (1.0 + r.gamma * draws[:, 4])
+    level = xp.arange(256, dtype=draws.dtype, device=device(draws)) / 255.0
+    return 255.0 * (gain[:, :, None] * level**gamma) ** (1.0 / exponent[:, None, None])
 
 
 class CameraDrift:
@@ -156,12 +173,9 @@ class CameraDrift:
 
     def reset(self, envs: range | list[int]) -> None:
         """Draw the cameras of environments."""
-        r, level = self._settings, np.arange(256) / 255.0
-        for b in envs:
-            draw = self._streams[b].uniform(-1.0, 1.0, 5)
-            gain = (1.0 + r.exposure * draw[0]) * (1.0 + r.white_balance * draw[1:4])
-            exponent = self._gamma * (1.0 + r.gamma * draw[4])
-            self._curves[b] = 255.0 * (gain[:, None] * level**self._gamma) ** (1.0 / exponent)
+        if len(envs):
+            draws = np.stack([self._streams[b].uniform(-1.0, 1.0, 5) for b in envs])
+            self._curves[list(envs)] = response_curves(draws, self._settings, self._gamma)
 
     def apply(self, images: np.ndarray, *, noise: bool = True, envs: Sequence[int] | None = None) -> np.ndarray:
         """8-bit images (n, H, W, 3) of these cameras; ``noise``: add the noise of a frame.

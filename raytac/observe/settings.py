@@ -1,4 +1,4 @@
-"""Settings of the observation of a tactile sensor: names, sizes and units, checked before anything is computed."""
+"""Settings of a tactile sensor's observation: names, sizes and units, checked at once."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from raytac.optics.registry import chosen_optics
 from raytac.sensor.options import LARGEST_SIDE, checked_resolution
 from raytac.specs.sensor import SensorSpec
 
-MODALITIES = ("rgb", "markers", "marker_visible", "height", "indentation", "contact", "wrench")
+MODALITIES = ("rgb", "markers", "marker_visible", "height", "indentation", "contact", "traction", "wrench")
 """Names that ``modalities`` accepts:
 
 - ``rgb``: the camera's image, uint8, (H, W, 3);
@@ -26,40 +26,47 @@ MODALITIES = ("rgb", "markers", "marker_visible", "height", "indentation", "cont
 - ``height``: height of the surface over the pad frame's origin, (rows, columns);
 - ``indentation``: height at rest minus height, (rows, columns); negative where the gel bulges;
 - ``contact``: share of a cell that is in contact, (rows, columns), 0 to 1;
+- ``traction``: force on the pad per area of a cell, pad frame, (rows, columns, 3);
 - ``wrench``: force on the pad and torque about the pad frame's origin, pad frame, (6,).
 """
 SCALES: Mapping[str, float | tuple[float, ...]] = {
     "markers": 1e-3,
     "height": 1e-3,
     "indentation": 1e-3,
+    "traction": 1e4,
     "wrench": (10.0, 10.0, 10.0, 0.1, 0.1, 0.1),
 }
-"""Divisors that bring values to the order of 1: lengths [m], force [N] and torque [N m]."""
+"""Divisors that bring values to the order of 1: lengths [m], traction [Pa], force [N] and torque [N m]."""
 
 
 @dataclass(frozen=True)
 class ObservationSettings:
-    """Choices of one sensor's observation. Optical mode, marker model and pad physics change values, never shapes."""
+    """Choices of one sensor's observation.
+
+    Optical mode, marker model and pad physics change values, never shapes.
+    """
 
     modalities: tuple[str, ...] = ("markers",)
     """Names of ``MODALITIES``; nothing else is computed."""
     resolution: tuple[int, int] | str | None = None
     """(width, height) of ``rgb`` [px], or text as ``"64x48"``; None is the sensor's own."""
     crop: str | tuple[int, int, int, int] = "centre"
-    """Crop of the rendered image. ``"centre"`` keeps the pixels square and takes the largest centred part that fits;
-    (left, top, right, bottom) removes that many pixels of the observed size, and the view is scaled to the observed shape."""
+    """Crop of the rendered image: ``"centre"`` or (left, top, right, bottom).
+
+    ``"centre"`` keeps the pixels square and takes the largest centred part that fits. Four numbers remove that many pixels of the observed
+    size, and the view is scaled to the observed shape."""
     downscale: int = 1
     """The image is rendered this many times as large along both sides and averaged."""
     difference: bool = False
-    """``rgb`` becomes (255 + image − image at rest) // 2, which is 127 where nothing has changed and cannot overflow."""
+    """Make ``rgb`` (255 + image − image at rest) // 2: 127 where nothing changed, no overflow."""
     map_shape: tuple[int, int] = (32, 32)
-    """(rows, columns) of ``height``, ``indentation`` and ``contact``: means over equal cells of the pad, no more than
-    its grid has nodes."""
+    """(rows, columns) of maps: ``height``, ``contact`` and so on; at most the grid's nodes."""
     stack: int = 1
-    """Number of last observations: images are stacked in the channels, all else along a new first axis, oldest first. After a reset all
-    are the first one."""
+    """Number of last observations that are stacked, oldest first.
+
+    Images are stacked in the channels, all else along a new first axis. After a reset all are the first one."""
     normalise: bool = True
-    """Divide by ``SCALES``; else SI units. Images are 8-bit and contact is a ratio in both cases."""
+    """Divide by ``SCALES``; else SI units. Images stay 8-bit and contact a ratio."""
     scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
     """In place of those of ``SCALES``, by modality."""
     optics: str | OpticsConfig[Any] = "taxim"
@@ -116,8 +123,8 @@ class ObservationSettings:
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Outputs of a ``TactileSensor`` that are needed; the surface, from which maps are made, is always there."""
-        return tuple(name for name in ("rgb", "wrench") if name in self.modalities)
+        """Outputs of a ``TactileSensor`` that are needed besides the surface, which is always there."""
+        return tuple(name for name in ("rgb", "traction", "wrench") if name in self.modalities)
 
 
 @dataclass(frozen=True)
@@ -134,7 +141,7 @@ class Layout:
 
     @property
     def crop(self) -> tuple[int, int, int, int] | None:
-        """(left, top, width, height) of the piece of the rendered image that is observed [px]; None is all of it."""
+        """Observed piece of the rendered image, (left, top, width, height) [px]; None is all of it."""
         k, (width, height) = self.downscale, self.observed
         piece = k * self.crop_x, k * self.crop_y, k * width, k * height
         return None if piece[2:] == self.rendered else piece

@@ -1,4 +1,4 @@
-"""Observations for learners: shapes, types and bounds, spaces of Gymnasium, tensors of PyTorch."""
+"""Spaces of Gymnasium and tensors of PyTorch for observations."""
 
 from __future__ import annotations
 
@@ -29,8 +29,7 @@ class ArraySpec:
 def array_specs(sensor: SensorSpec, settings: ObservationSettings) -> dict[str, ArraySpec]:
     """Arrays of an observation with ``settings``, by modality.
 
-    Raises:
-        InputError: markers are observed and the sensor has none, or an image is too large.
+    Raises ``InputError``: markers are observed and the sensor has none, or an image is too large.
     """
     count = sensor.markers.rows * sensor.markers.columns
     if settings.needs_markers and not count:
@@ -43,6 +42,7 @@ def array_specs(sensor: SensorSpec, settings: ObservationSettings) -> dict[str, 
         "height": ArraySpec(tuple(settings.map_shape), np.float32, -np.inf, np.inf),
         "indentation": ArraySpec(tuple(settings.map_shape), np.float32, -np.inf, np.inf),
         "contact": ArraySpec(tuple(settings.map_shape), np.float32, 0.0, 1.0),
+        "traction": ArraySpec((*settings.map_shape, 3), np.float32, -np.inf, np.inf),
         "wrench": ArraySpec((6,), np.float32, -np.inf, np.inf),
     }
     return {name: _stacked(name, specs[name], settings.stack) for name in settings.modalities}
@@ -67,8 +67,7 @@ def gymnasium_space(specs: Mapping[str, ArraySpec]) -> gymnasium.spaces.Dict:
 def as_tensors(observation: Mapping[str, Any]) -> dict[str, Any]:
     """``torch.Tensor`` by name, through DLPack, without a copy; nested dictionaries stay nested.
 
-    Raises:
-        BackendError: PyTorch is not installed.
+    Raises ``BackendError``: PyTorch is not installed.
     """
     try:
         import torch  # pyright: ignore[reportMissingImports]  # gigabytes: the checks run without it

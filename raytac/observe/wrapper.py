@@ -1,4 +1,4 @@
-"""Gymnasium wrappers that add observations of tactile sensors to an environment, or to a vector of them."""
+"""Gymnasium wrappers that add tactile observations to an environment or a vector of them."""
 
 from __future__ import annotations
 
@@ -19,12 +19,15 @@ except ModuleNotFoundError as error:
     raise BackendError("Gymnasium is not installed: pip install 'raytac[rl]'") from error
 
 Frames = Callable[..., Mapping[str, TactileFrame]]
-"""Function that returns the present frame of each sensor, as ``TactileWorld.observe``. Where some environments of a vector are reset it
-is called with ``envs=``, a list of them, and returns frames of these alone."""
+"""Function that returns the present frame of each sensor, as ``TactileWorld.observe``.
+
+Where some environments of a vector are reset, it is called with ``envs=``, a list of them, and returns frames of these alone."""
 
 
 class AddTactile(gymnasium.Wrapper):
-    """Dict of the environment's observation (its keys if it is a Dict, else ``observation``) and the modalities of each sensor.
+    """Dict of the environment's observation and the modalities of each sensor.
+
+    The environment's observation keeps its keys if it is a Dict; else it is ``observation``.
 
     .. code-block:: python
 
@@ -41,7 +44,6 @@ class AddTactile(gymnasium.Wrapper):
         """Wrap ``env``.
 
         Args:
-            env: environment to wrap.
             observers: observer of each sensor, with one environment and without ``difference``.
             frames: function that returns the present frame of each sensor.
 
@@ -56,8 +58,7 @@ class AddTactile(gymnasium.Wrapper):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
         """Reset the environment and every observer.
 
-        Raises:
-            InputError: an observer whose frame is not given; in ``step`` too.
+        Raises ``InputError``: an observer whose frame is not given; in ``step`` too.
         """
         observation, info = self.env.reset(seed=seed, options=options)
         for observer in self.observers.values():
@@ -89,8 +90,7 @@ class AddTactileVector(gymnasium.vector.VectorWrapper):
     def __init__(self, env: gymnasium.vector.VectorEnv, observers: Mapping[str, TactileObserver], frames: Frames) -> None:
         """As ``AddTactile``, with observers of as many environments as ``env`` has.
 
-        Raises:
-            InputError: an observer of another number of environments, or a name that the observation has already.
+        Raises ``InputError``: an observer of another number of environments, or a name that the observation has already.
         """
         super().__init__(env)
         _check(observers, env.num_envs, frames)
@@ -105,8 +105,7 @@ class AddTactileVector(gymnasium.vector.VectorWrapper):
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Reset the environments, or those of ``options["reset_mask"]``, and their observers.
 
-        Raises:
-            InputError: an observer whose frame is not given; in ``step`` too.
+        Raises ``InputError``: an observer whose frame is not given; in ``step`` too.
         """
         chosen = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
         observation, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]

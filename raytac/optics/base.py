@@ -29,6 +29,24 @@ class OpticsImages:
     uncovered: np.ndarray | None = None
     """Share of contact pixels (B,) whose table bin no sample reached; None where unknown."""
 
+    def repeated(self, batch: int, envs: list[int], images: OpticsImages | None) -> OpticsImages:
+        """These images (B = 1) in every environment of a batch, but ``images`` in ``envs``."""
+
+        def spread(one: np.ndarray, some: np.ndarray | None) -> np.ndarray:
+            whole = np.repeat(one, batch, axis=0)
+            if some is not None:
+                whole[envs] = some
+            return whole
+
+        merged: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            some = None if images is None else getattr(images, name)
+            if isinstance(value, dict):
+                merged[name] = {key: spread(one, None if some is None else some[key]) for key, one in value.items()}
+            else:
+                merged[name] = None if value is None else spread(value, some)
+        return OpticsImages(**merged)
+
 
 class OpticalMode(Protocol):
     """One way to make images, built once for one sensor, resolution and set of outputs.

@@ -19,7 +19,7 @@ from raytac.specs.sensor import SensorSpec
 class Cropped(OpticsConfig[OpticalMode]):
     """Another mode that renders a piece of its image, equal to that of the whole image.
 
-    Modes that need all of the image, as for shadows of a table, and modes of one's own render it and cut.
+    Modes that need all of the image, as for shadows of a table, and a user's modes render it and cut.
     """
 
     config: OpticsConfig[Any]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
 from raytac.checks import check_methods
 from raytac.errors import InputError
@@ -31,14 +32,13 @@ class ImageCut:
 class DeviceImage:
     """One optical mode whose images are cut on the device; one recording a batch size."""
 
-    def __init__(self, mode: Any, grid: PadGrid, cut: ImageCut, *, difference: bool) -> None:
+    def __init__(self, mode: Any, grid: PadGrid, cut: ImageCut, *, difference: bool, ink: np.ndarray | None = None) -> None:
         """Render the pad at rest once, which prepares the mode for its grid.
 
         Args:
             mode: one that renders on the device, as ``DeviceMode`` does.
-            grid: of the heights to come.
-            cut: what is kept.
             difference: give (255 + image − image at rest) // 2 instead of the image.
+            ink: share of marker dots at rest (1, Ny, Nx); None without.
 
         Raises InputError: a mode that has no images on the device, or a cut beyond the rendered image.
         """
@@ -57,7 +57,8 @@ class DeviceImage:
         self._is_whole = (width, height) == self._rendered
         self._frozen: dict[int, Any] = {}
         mode.prepare(grid)
-        image = mode.render_device(*self.upload(GelSurface.at_rest(grid))).rgb
+        dots = None if ink is None else self.mi.Float(ink.ravel())
+        image = mode.render_device(*self.upload(GelSurface.at_rest(grid)), dots).rgb
         self._rest = None
         if difference:
             rest = self._kept(image, 1, None)
@@ -68,19 +69,21 @@ class DeviceImage:
         """Heights (B·Ny·Nx) and contact of a surface on the device; heights must be finite."""
         return upload(self.mi, surface)
 
-    def __call__(self, heights: Float, contact: UInt8 | None = None) -> Any:
+    def __call__(self, heights: Float, contact: UInt8 | None = None, ink: Float | None = None) -> Any:
         """Images (B, height, width, 3), uint8, complete: a Dr.Jit tensor that DLPack hands on.
 
         Args:
             heights: [m], B·Ny·Nx of them on this device, finite, which is not checked: a Dr.Jit array, or a float32 PyTorch tensor.
             contact: where the object touches, as many bytes; only for modes that need it.
+            ink: share of marker dots at the nodes, as many; None without.
 
         Raises InputError: no whole number of grids, or contact missing.
         """
         with RENDERER:
             mi = self.mi
-            heights, contact = (self._array(v, t) for v, t in ((heights, mi.Float), (contact, mi.UInt8)))
-            image = self._mode.render_device(heights, contact).rgb
+            given = ((heights, mi.Float), (contact, mi.UInt8), (ink, mi.Float))
+            heights, contact, ink = (self._array(values, kind) for values, kind in given)
+            image = self._mode.render_device(heights, contact, ink).rgb
             envs = dr.width(heights) // self._nodes
             if not self._is_whole or self._rest is not None:
                 if envs not in self._frozen:

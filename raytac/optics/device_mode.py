@@ -100,8 +100,10 @@ class DeviceMode(ABC):
         self._frozen: dict[tuple[str, bool, int], Callable[..., Any]] = {}
         self._at_rest: OpticsImages | None = None
         """Images of one untouched pad, which every environment at rest shows."""
-        self._is_running, self._last = False, _nothing
-        """True if nobody has waited for the images that were begun last, and a reference to these."""
+        self._is_running = False
+        """True if nobody has waited for the images that were begun last."""
+        self._last: Callable[[], _Launched | None] = lambda: None
+        """Reference to these images."""
         self._set_up()
 
     def _set_up(self) -> None:  # noqa: B027 (a mode may need nothing more)
@@ -112,10 +114,9 @@ class DeviceMode(ABC):
 
         What is rendered equals the same piece of the whole image. Called before the first frame.
         """
-        if not self._crops:
-            return False
-        self.camera = replace(self.camera, crop=piece)
-        return True
+        if self._crops:
+            self.camera = replace(self.camera, crop=piece)
+        return self._crops
 
     @property
     def _crops(self) -> bool:
@@ -141,8 +142,7 @@ class DeviceMode(ABC):
     def prepare(self, grid: PadGrid) -> None:
         """Build what depends on the pad's grid; done at the first frame and kept.
 
-        Raises:
-            InputError: the camera sees beyond the pad, or a second grid.
+        Raises ``InputError``: the camera sees beyond the pad, or a second grid.
         """
         if self._grid is not None:
             names = "x", "y", "rest"
@@ -194,8 +194,7 @@ class DeviceMode(ABC):
         Untouched pads are not rendered again: they show the image at rest, which is rendered once. An environment whose heights are not
         finite fails alone: its ``rgb`` is 0, its other images are NaN, its contact is False.
 
-        Raises:
-            InputError: a surface whose arrays do not have the shape of its grid, an empty batch, one too large, or a second grid.
+        Raises ``InputError``: a surface whose arrays do not have the shape of its grid, an empty batch, one too large, or a second grid.
         """
         return self.start(surface)()
 
@@ -203,11 +202,8 @@ class DeviceMode(ABC):
         """Begin ``render``; returns a function that waits for the images and copies them back.
 
         Dr.Jit computes them beside what the caller does next. At most one call is under way: the next one waits for it, and copies its
-        images back if they may still be asked for, so that no more than one batch is on the device. Dr.Jit lets only the thread that
-        launched a kernel wait for it: in another thread the function renders the surface again. The arrays of ``surface`` may be written
-        to at once: the images are those of its values at the call.
-
-        Raises the same as ``render``.
+        images back if they may still be asked for. Only the thread that launched a kernel can wait for it: in another thread the function
+        renders again. The images are those of ``surface`` at the call. Raises the same as ``render``.
         """
         with RENDERER:
             self._finish()
@@ -230,18 +226,16 @@ class DeviceMode(ABC):
             if whole and some is not None:
                 return some
             assert self._at_rest is not None
-            return _spread(self._at_rest, some, pressed, surface.batch)
+            return self._at_rest.repeated(surface.batch, pressed, some)
 
         result = _Launched(images, partial(self.render, surface))
         self._last, self._is_running = ref(result), begun is not None
         return result
 
     def _finish(self) -> None:
-        """Wait for the call that is under way, if there is one; its images are copied back if anybody may ask for them."""
-        if not self._is_running:
-            return
-        last, self._is_running = self._last(), False
-        if last is None or not last.keep():
+        """Wait for the images under way; copy them back if anybody may ask for them."""
+        last, running, self._is_running = self._last(), self._is_running, False
+        if running and (last is None or not last.keep()):
             dr.sync_thread()
 
     def _pressed(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> list[int]:
@@ -272,8 +266,8 @@ class DeviceMode(ABC):
             ink: share of marker dots at each node, B·Ny·Nx, in [0, 1].
 
         Raises:
-            InputError: nothing was rendered or prepared before, heights of no whole number of grids, contact or ink of another width, a
-                batch too large, or a mode with noise.
+            InputError: no call of ``prepare`` before, no whole number of grids, contact or ink of another width, too large a batch, or a
+                mode with noise.
         """
         if self._grid is None:
             raise InputError("heights", value=type(heights).__name__, rule="call prepare(grid) first: it tells the grid")
@@ -324,9 +318,9 @@ class DeviceMode(ABC):
     def _check_image(self, name: str, image: object) -> None:
         """Raise InputError unless ``image`` is an 8-bit image at this resolution."""
         kind = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
-        wanted = (*self.camera.resolution[::-1], 3)
-        if kind != f"uint8 {wanted}":
-            raise InputError(name, value=kind, rule=f"must be a uint8 image of shape {wanted}")
+        shape = (*self.camera.resolution[::-1], 3)
+        if kind != f"uint8 {shape}":
+            raise InputError(name, value=kind, rule=f"must be a uint8 image of shape {shape}")
 
     def _checked(self, surface: GelSurface) -> tuple[np.ndarray, np.ndarray]:
         """Heights (B, Ny, Nx) float32, failed environments at rest, and which those are (B,)."""
@@ -359,7 +353,10 @@ class DeviceMode(ABC):
 
 
 class _Launched:
-    """Images that one thread has launched, waited for and copied back once; another thread renders them again."""
+    """Images that the launching thread waits for and copies back once.
+
+    Another thread renders them again.
+    """
 
     def __init__(self, wait: Callable[[], OpticsImages], again: Callable[[], OpticsImages]) -> None:
         self._wait, self._again, self._caller = wait, again, threading.get_ident()
@@ -379,29 +376,6 @@ class _Launched:
                 self._images = self._again()
             assert self._images is not None
             return self._images
-
-
-def _nothing() -> None:
-    """Reference to no images."""
-
-
-def _spread(rest: OpticsImages, images: OpticsImages | None, envs: list[int], batch: int) -> OpticsImages:
-    """``rest`` (B = 1) in every environment of a batch, but ``images`` in those of ``envs``."""
-
-    def spread(rest: np.ndarray, some: np.ndarray | None) -> np.ndarray:
-        whole = np.repeat(rest, batch, axis=0)
-        if some is not None:
-            whole[envs] = some
-        return whole
-
-    merged: dict[str, Any] = {}
-    for name, value in vars(rest).items():
-        some = None if images is None else getattr(images, name)
-        if isinstance(value, dict):
-            merged[name] = {key: spread(one, None if some is None else some[key]) for key, one in value.items()}
-        else:
-            merged[name] = None if value is None else spread(value, some)
-    return OpticsImages(**merged)
 
 
 def upload(mi: Any, surface: GelSurface) -> tuple[Float, UInt8]:

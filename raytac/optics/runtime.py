@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,7 +12,7 @@ from typing import Any
 
 import drjit as dr
 
-from raytac.device import llvm_library, resolve_device
+from raytac.device import LLVM_MINIMUM, LLVM_NAMED_BY_USER, llvm_library, resolve_device
 from raytac.errors import BackendError
 
 VARIANTS = {"cuda": "cuda_ad_rgb", "cpu": "llvm_ad_rgb"}
@@ -23,8 +24,7 @@ def load_mitsuba(device: str = "auto") -> tuple[Any, str]:
     Returns the module and the device that it runs on. A process has one variant: types of Mitsuba plugins are bound to the first, and
     ``auto`` stays with it. The first ``cuda`` of a process traces one ray; where that fails, ``auto`` warns and takes the CPU.
 
-    Raises:
-        BackendError: no LLVM library (CPU), no CUDA that works, or a process that already uses the other variant.
+    Raises ``BackendError``: no LLVM library or one too old (CPU), no CUDA that works, or a process that already uses the other variant.
     """
     resolved = resolve_device(device)
     if resolved == "cpu":
@@ -86,16 +86,33 @@ def _try_variant(mi: Any, variant: str, *, trace: bool = False) -> str:
 
 
 def _require_llvm() -> None:
-    if llvm_library() is None:
+    library = llvm_library()
+    if library is None:
         raise BackendError(
             "the ray tracer needs LLVM (or an NVIDIA GPU), and no libLLVM was found: "
             "`pip install karellen-llvm-core`, or set DRJIT_LIBLLVM_PATH to a libLLVM of version 16 or newer; "
             "`raytac doctor` tells what was tried"
         )
+    version = dr.detail.llvm_version()
+    if version[0] < LLVM_MINIMUM and not LLVM_NAMED_BY_USER:
+        raise BackendError(
+            f"Dr.Jit has loaded libLLVM {'.'.join(map(str, version))}, which may abort the process, because drjit or mitsuba was imported "
+            f"before raytac: import raytac.optics first, or set DRJIT_LIBLLVM_PATH={library}"
+        )
+
+
+def share_cores() -> None:
+    """Let Dr.Jit use at most half of the cores; a smaller number set before stays.
+
+    Its threads wait busily for the next image. Where physics and a policy run between two images, those threads take their cores, and
+    libraries whose threads wait for each other then wait for threads that do not run.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    dr.set_thread_count(min(dr.thread_count(), max(cores // 2, 1)))
 
 
 RENDERER = RLock()
-"""Held by whoever records, launches or waits for kernels: Dr.Jit keeps what it records in one place of the process."""
+"""Lock around recording, launching, waiting: Dr.Jit records in one place of the process."""
 
 
 @contextmanager
@@ -116,12 +133,11 @@ def no_collection() -> Iterator[None]:
 
 
 def peak_bytes(call: Callable[[], object], device: str, *, calls: int = 3) -> int:
-    """Most bytes of Dr.Jit's arrays during one of ``calls`` runs of ``call``, beyond those before; 0 without Dr.Jit.
+    """Most bytes of Dr.Jit's arrays in one of ``calls`` runs of ``call``, beyond those before.
 
-    Kernels run beside the code that launches them, so memory that one frees may or may not be free in time for the next: only the
-    largest of several runs is the same from one process to another. The allocator's cache is emptied before each run, so that memory
-    kept from earlier work does not hide what the call needs; that makes the next calls slower. Acceleration structures of the ray
-    tracer (Embree, OptiX) are not Dr.Jit arrays and not counted.
+    It is 0 without Dr.Jit. Kernels run beside the code that launches them, so memory that one frees may or may not be free for the next:
+    only the largest of several runs is the same in every process. The allocator's cache is emptied before each run, which makes the next
+    calls slower. Acceleration structures of the ray tracer (Embree, OptiX) are not Dr.Jit arrays and not counted.
     """
     backend = dr.JitBackend.CUDA if device == "cuda" else dr.JitBackend.LLVM
     peak = 0

@@ -1,4 +1,4 @@
-"""Pads: a rigid one whose gel gives way by a load law, and a soft one solved by ``ipc``."""
+"""Pads: a rigid one whose gel yields by a load law, and a soft one solved by ``ipc``."""
 
 import lazy_loader
 

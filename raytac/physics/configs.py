@@ -38,8 +38,7 @@ class Rigid:
 class Ipc:
     """Soft pad: the gel solved with contact, friction and large deformation by ``ipc``.
 
-    Raises:
-        InputError: an unknown level, or settings of another type.
+    Raises ``InputError``: an unknown level, or settings of another type.
     """
 
     level: str | PadMesh | None = None

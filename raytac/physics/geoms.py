@@ -23,8 +23,7 @@ def body_parts(model: mujoco.MjModel, body: int | str, groups: Sequence[int] | N
     Bodies without joints between them are separate bodies in MuJoCo too; give each its own pose. A model often has a coarse geom
     for collisions beside a fine one to look at: ``groups`` keeps only the geoms of these MuJoCo groups (0 to 5), None keeps all.
 
-    Raises:
-        InputError: no such body, no geom of it left, or one that cannot be sensed (see ``geom_part``).
+    Raises ``InputError``: no such body, no geom of it left, or one that cannot be sensed (see ``geom_part``).
     """
     index = _index(model, mujoco.mjtObj.mjOBJ_BODY, model.nbody, "body", body)
     first = int(model.body_geomadr[index])
@@ -45,8 +44,7 @@ def geom_part(model: mujoco.MjModel, geom: int | str) -> Part:
     ``hfield`` becomes the closed mesh that MuJoCo collides with. An ``sdf`` is sensed by the mesh that MuJoCo's compiler makes of
     it: exact where it was given by a mesh, else as fine as the plugin's ``octree`` cuts it.
 
-    Raises:
-        InputError: no such geom, or a type or size that has no part.
+    Raises ``InputError``: no such geom, or a type or size that has no part.
     """
     index = _index(model, mujoco.mjtObj.mjOBJ_GEOM, model.ngeom, "geom", geom)
     kind = mujoco.mjtGeom(int(model.geom_type[index])).name.removeprefix("mjGEOM_").lower()

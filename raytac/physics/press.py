@@ -257,7 +257,7 @@ class PressPad(ABC):
     def follow(self, stage: StageSpec, steps: int = 1) -> Iterator[PadReading]:
         """Readings along one more stage, from wherever the pad is now.
 
-        For a loop in which somebody else decides where to go next.
+        For a loop that decides step by step where to go next.
 
         A pad that was not run yet starts above the gel. The readings are of no stage of the scene (their ``stage`` is −1). Nothing moves
         before the first is asked for; who stops asking leaves the pad where it is then, and may follow another stage from there.

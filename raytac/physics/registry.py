@@ -47,8 +47,7 @@ def scene_physics(physics: PhysicsConfig | None, scene: _Scene) -> PhysicsConfig
 
     A ``level`` that is not given is the scene's, else the coarsest.
 
-    Raises:
-        SpecError: the scene names a physics that is not known; names file, key and choices.
+    Raises ``SpecError``: the scene names a physics that is not known; names file, key and choices.
     """
     if physics is None:
         try:

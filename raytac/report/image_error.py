@@ -82,8 +82,7 @@ def flip_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
     8-bit values / 255 are read as sRGB.
 
-    Raises:
-        BackendError: ``flip-evaluator`` is not installed.
+    Raises ``BackendError``: ``flip-evaluator`` is not installed.
     """
     if not has_flip():
         raise BackendError("FLIP needs the package flip-evaluator: `pip install 'raytac[report]'`, or leave FLIP out")

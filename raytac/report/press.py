@@ -211,8 +211,7 @@ def press_peaks(
 
     The grid's pitch is that of a pixel of ``size`` (width, height) on the pad, at most 0.1 mm.
 
-    Raises:
-        SpecError: an unknown sensor or scene, or a file that breaks a rule.
+    Raises ``SpecError``: an unknown sensor or scene, or a file that breaks a rule.
     """
     pressed = TactileSensor(sensor, outputs=("height",), resolution=size, device="cpu", seed=seed)
     return pressed.spec, {Path(scene).stem: pressed.press(scene).surface for scene in scenes}

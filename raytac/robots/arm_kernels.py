@@ -1,4 +1,4 @@
-"""Kernels of an arm's control over B environments: numbers of states, springs, poses, servos."""
+"""Kernels of an arm's control: numbers of states, springs, poses, servos."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false

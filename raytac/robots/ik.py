@@ -80,7 +80,6 @@ class DifferentialIk:
         """Set the program up.
 
         Args:
-            arm: joints and site.
             max_velocity: greatest |q̇| (n,) or one for all [rad/s or m/s].
             posture: q₀ (n,), joint positions that a redundant arm tends to; None: the middle of the limits, 0 without limits.
             posture_weight: w above, against 1 per metre and 1 per radian of the pose. It moves the site off its target by about
@@ -221,7 +220,6 @@ class PoseServo:
         """Set the law.
 
         Args:
-            arm: joints and site.
             max_velocity: greatest |q̇| (n,) or one for all [rad/s or m/s].
             posture: q₀ (n,); None: no second term.
             posture_gain: g, share of q₀ − q that a step covers.
@@ -263,7 +261,7 @@ class PoseServo:
         return self._latest.targets(world_from_target, twist, duration)
 
     def struct(self, arrays: Mapping[str, wp.array]) -> Any:
-        """Arguments of the kernel ``servo_step`` for B states, on the device of ``arrays``: the numbers ``SERVO_READS`` of the arm."""
+        """Arguments of ``servo_step`` from ``arrays``, ``SERVO_READS`` of B states on a device."""
         joints, n = arrays["joints"], len(self.arm)
         servo: Any = Servo()
         servo.joints, servo.anchor, servo.axis, servo.site = (arrays[name] for name in SERVO_READS)

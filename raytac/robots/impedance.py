@@ -56,7 +56,6 @@ class CartesianImpedance:
         """Set the springs.
 
         Args:
-            arm: joints and site.
             stiffness: K of the translations [N/m].
             rotational_stiffness: K of the rotations [N·m/rad].
             damping_ratio: ζ.

@@ -22,10 +22,6 @@ from raytac.se3 import pose as rigid
 from raytac.specs.sensor import GelpadSpec, SensorSpec
 from raytac.specs.sensor_file import sensor_spec
 
-_WALL = 0.8e-3
-"""Thickness of a case's walls and back [m]: a guess, from the Mini's outside of 32 × 28 mm."""
-_CASE_DENSITY = 1000.0
-"""Mean density of a case with its camera [kg/m³]: a guess; the Mini without gel weighs 22 g."""
 _MARK = "raytac:"
 """Prefix of a sensor's custom text in the model, which holds the name or path of its file.
 
@@ -33,7 +29,7 @@ The text outlives ``MjSpec.compile``, ``to_xml`` and ``attach``, whose prefix it
 _IN_CODE = "made in code"
 """Text of a sensor that was mounted as a specification, which no file has."""
 _TOUCH_RADIUS = 3e-3
-"""Contact radius [m] and mass [kg] of MuJoCo's contact, as stiff as the gel there (a guess)."""
+"""Radius [m] and mass [kg] for which MuJoCo's contact is as stiff as the gel (a choice)."""
 _TOUCH_MASS = 0.05
 _FARTHEST, _HEAVIEST = 1.0, 5.0
 """Distance from the carrier [m] and mass [kg] of mistaken units; GelSights: 20 to 200 g."""
@@ -84,7 +80,7 @@ class RobotModel:
 
 def case_depth(sensor: SensorSpec) -> float:
     """Distance [m] from the pad centre to the outside of the case's back."""
-    return _WALL - sensor.case.floor_z
+    return sensor.case.wall - sensor.case.floor_z
 
 
 def standing_on(sensor: SensorSpec) -> np.ndarray:
@@ -112,8 +108,8 @@ def mount(
         right = raytac.mount(spec, "gelsight_mini", body="right_finger", pose=finger_from_pad, name="right")
         world = raytac.TactileWorld(spec, touches=["cube"])
 
-    The case is a box from the outside of the back to the gel's bonded face, the inside of ``sensor.case`` plus walls of 0.8 mm
-    (a guess); it collides. The gel is a box from there to z = 0. Both carry their mass. ``spec`` is changed in place and compiles as
+    The case is a box from the outside of the back to the gel's bonded face, the inside of ``sensor.case`` plus its walls; it
+    collides. The gel is a box from there to z = 0. Both carry their mass. ``spec`` is changed in place and compiles as
     before.
 
     Args:
@@ -123,7 +119,7 @@ def mount(
         name: prefix of the sensor's names in the model; several sensors on a robot need several names.
         pose: pose (4, 4) of the pad frame in the frame of that site or body; None: ``standing_on(sensor)``, the back of the case on the
             origin, the pad looking along +z.
-        mass: mass of sensor and gel [kg]; None: the gel's by its density, the case's by a mean density of 1000 kg/m³ (a guess).
+        mass: mass of sensor and gel [kg]; None: the gel's by its density, the case's by its own.
         collide: MuJoCo collides the gel block too, for loops that only a ``TactileReader`` looks at. Its contacts have the gel's
             friction, and about its stiffness at one point under a body of 50 g: MuJoCo's scales with masses and the number of points.
 
@@ -262,7 +258,7 @@ def _masses(sensor: SensorSpec, mass: float | None) -> tuple[float, float]:
     (length, width), thickness = sensor.gelpad.size, sensor.gelpad.thickness
     gel = sensor.gelpad.density * length * width * thickness
     if mass is None:
-        return _CASE_DENSITY * math.prod(_case_size(sensor)), gel
+        return sensor.case.density * math.prod(_case_size(sensor)), gel
     if not (math.isfinite(mass) and mass > gel):
         raise InputError("mass", value=mass, rule=f"must be finite and more than the gel's {gel:.4g} kg")
     return mass - gel, gel
@@ -270,8 +266,8 @@ def _masses(sensor: SensorSpec, mass: float | None) -> tuple[float, float]:
 
 def _case_size(sensor: SensorSpec) -> tuple[float, float, float]:
     """Outer size of the case along x, y, z [m], without the gel."""
-    (length, width), thickness = sensor.case.size, sensor.gelpad.thickness
-    return length + 2.0 * _WALL, width + 2.0 * _WALL, case_depth(sensor) - thickness
+    (length, width), wall = sensor.case.size, sensor.case.wall
+    return length + 2.0 * wall, width + 2.0 * wall, case_depth(sensor) - sensor.gelpad.thickness
 
 
 def _sensor_model(

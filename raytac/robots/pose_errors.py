@@ -13,14 +13,12 @@ from raytac.warp_runtime import Recorded, start_warp
 
 
 class PoseErrors:
-    """``se3.pose_error`` of ``pairs`` times B poses, B fixed, of NumPy arrays or of PyTorch tensors on a device."""
+    """``se3.pose_error`` of ``pairs`` · B poses, B fixed; arrays of NumPy or PyTorch."""
 
     def __init__(self, count: int, pairs: int = 1, device: str | None = None) -> None:
         """Arrays of ``count`` B poses, ``pairs`` times.
 
         Args:
-            count: number of poses B.
-            pairs: number of pairs in a call.
             device: None takes NumPy arrays. With a device, such as "cuda:0" or "cpu", poses and results are PyTorch tensors on it, and a
                 call copies nothing to the host; its kernel runs in Warp's present stream.
         """

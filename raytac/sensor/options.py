@@ -35,9 +35,11 @@ def sensor_outputs(optics: str | OpticsConfig[Any] | type[OpticsConfig[Any]]) ->
 
 def checked_outputs(outputs: Sequence[str] | str, optics: OpticsConfig[Any]) -> tuple[str, ...]:
     """Names in the order of ``OUTPUTS``; ``InputError`` if unknown, or not made by ``optics``."""
-    if outputs == "markers" or (isinstance(outputs, (list, tuple)) and "markers" in outputs):
+    several = outputs if isinstance(outputs, (list, tuple)) else ()
+    given = [outputs] if isinstance(outputs, str) else [name for name in several if isinstance(name, str)]
+    if "markers" in given:
         raise InputError("outputs", value=outputs, rule="markers are asked for by the argument markers, as in markers='fots'")
-    if outputs == "force" or (isinstance(outputs, (list, tuple)) and "force" in outputs):
+    if "force" in given:
         raise InputError("outputs", value=outputs, rule="frame.force always comes, without asking; 'wrench' adds its torque")
     outputs, offered = check_names("outputs", outputs, OUTPUTS), sensor_outputs(optics)
     for name in outputs:

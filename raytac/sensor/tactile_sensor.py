@@ -129,8 +129,7 @@ class TactileSensor:
     def __reduce__(self) -> tuple[Any, ...]:
         """A sensor of the same settings.
 
-        Raises:
-            InputError: an optical mode of one's own, which only its maker can copy, or markers with a history, which would be lost.
+        Raises ``InputError``: an optical mode of one's own, which only its maker can copy, or markers with a history, which would be lost.
         """
         if isinstance(self.optics, BuiltOptics):
             rule = "cannot be copied or pickled with its sensor: make the other sensor with an optical mode of its own"
@@ -361,8 +360,7 @@ class TactileSensor:
 
         ``envs``: a mask (B,), a list, or None for all. ``load`` and ``press`` do it for all.
 
-        Raises:
-            InputError: no marker model was asked for, or an environment that does not exist.
+        Raises ``InputError``: no marker model was asked for, or an environment that does not exist.
         """
         self.marker_tracker.reset(envs)
 

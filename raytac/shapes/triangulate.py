@@ -44,8 +44,7 @@ def part_surface(part: Part, sag: float = SAG) -> ipc.TriMesh:
     Curved parts are inscribed: their vertices lie on them, their facets up to ``sag`` [m] inside (with at least 16 and at most 256
     facets around). A relief gets facets 0.2 mm apart, closed by its plane z = 0.
 
-    Raises:
-        InputError: a ``plane``, which has no closed surface.
+    Raises ``InputError``: a ``plane``, which has no closed surface.
     """
     size = part.size
     if part.kind == "mesh":

@@ -31,8 +31,7 @@ def find_file(what: str, name_or_path: str | Path, *, base: Path | None = None) 
     with no ``base``, to the working directory first and then to the folder that holds the shipped ``scenes/`` and ``lights/``, so
     that ``scenes/press/coin.toml`` means the same inside and outside a checkout; a warning says when the shipped file was taken.
 
-    Raises:
-        SpecError: no such name (the message lists those there are), or no such file.
+    Raises ``SpecError``: no such name (the message lists those there are), or no such file.
     """
     if not isinstance(name_or_path, (str, Path)):
         raise SpecError(f"must be a name or a path, not {type(name_or_path).__name__}", key=what, value=name_or_path)

@@ -89,8 +89,7 @@ def load_marker_motion(name_or_path: str | Path, *, base: Path | None = None) ->
 
     A shipped name such as ``"gelsight_mini"``, or a path, relative to ``base`` if given.
 
-    Raises:
-        SpecError: unknown name, unreadable file, unknown or missing key, wrong type, value out of range.
+    Raises ``SpecError``: unknown name, unreadable file, unknown or missing key, wrong type, value out of range.
     """
     path = find_file("marker motion", name_or_path, base=base)
     top = read_toml(path)

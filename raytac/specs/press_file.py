@@ -114,8 +114,7 @@ def press_of(
 def validate_press(sensor: SensorSpec, scene: PressScene) -> None:
     """Check a scene against the sensor that it is pressed into.
 
-    Raises:
-        SpecError: an indent as deep as the pad is thick or deeper, or an object whose origin starts or is sheared off the pad.
+    Raises ``SpecError``: an indent as deep as the pad is thick or deeper, or an object whose origin starts or is sheared off the pad.
     """
     pad = sensor.gelpad
     half = (pad.size[0] / 2, pad.size[1] / 2)

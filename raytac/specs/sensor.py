@@ -49,6 +49,8 @@ SENSOR_SCHEMA: Final[dict[str, Schema]] = {
         "size_mm": Number("[2, 300]", length=2),
         "floor_z_mm": Number("[-500, 0)"),
         "reflectance": Number("[0, 1)"),
+        "wall_mm": Number("[0.1, 50]", default=0.8e-3),
+        "density_kg_m3": Number("[10, 30000]", default=1000.0),
     },
     "camera": {
         "resolution_px": Integer("[8, 8192]", length=2),
@@ -154,7 +156,7 @@ class CoatSpec:
 
 @dataclass(frozen=True)
 class CaseSpec:
-    """The inside of the housing: four walls around the light and a floor behind the camera."""
+    """The housing: four walls around the light and a floor behind the camera."""
 
     size: Vec2
     """Inner extent along x and y [m]."""
@@ -162,6 +164,10 @@ class CaseSpec:
     """Pad-frame z of the floor (the camera board) [m], below the camera."""
     reflectance: float
     """Diffuse albedo of walls and floor, in [0, 1)."""
+    wall: float = 0.8e-3
+    """Thickness of walls and back [m]. 0.8 mm is a guess, from the Mini's outside of 32 × 28 mm."""
+    density: float = 1000.0
+    """Mean density of case and camera [kg/m³], a guess; the Mini without gel weighs 22 g."""
 
     def __post_init__(self) -> None:
         check_fields(vars(self), SENSOR_SCHEMA["case"], "case")

@@ -88,8 +88,7 @@ def load_lights(name_or_path: str | Path) -> LightsSpec:
 
     Whether each LED lies inside the case and outside the gel needs the sensor: ``load_sensor`` and ``validate_sensor`` check it.
 
-    Raises:
-        SpecError: as ``load_sensor``; also no LED, two LEDs of one name, or an axis of zero length.
+    Raises ``SpecError``: as ``load_sensor``; also no LED, two LEDs of one name, or an axis of zero length.
     """
     return _read_lights(find_file("lights", name_or_path))
 
@@ -99,8 +98,7 @@ def with_lights(sensor: SensorSpec, lights: LightsSpec | str | Path) -> SensorSp
 
     Its response stays, colour shading and black level too, though these belong to the lights that they were fitted with.
 
-    Raises:
-        SpecError: as ``load_lights`` and ``validate_sensor``.
+    Raises ``SpecError``: as ``load_lights`` and ``validate_sensor``.
     """
     return _valid(replace(sensor, lights=lights if isinstance(lights, LightsSpec) else load_lights(lights)))
 

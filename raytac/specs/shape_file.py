@@ -62,8 +62,7 @@ def check_params(kind: str, params: Mapping[str, Any], schema: Schema, prefix: s
 
     A file that it names is checked where it is read.
 
-    Raises:
-        SpecError: a length or count that is missing or out of its range, lengths that contradict each other, or an unknown name.
+    Raises ``SpecError``: a length or count that is missing or out of its range, lengths that contradict each other, or an unknown name.
     """
     if not isinstance(params, Mapping):
         raise SpecError("must be a mapping of names to values", key=f"{prefix}.params", value=params)

@@ -252,8 +252,7 @@ def check_fields(values: Mapping[str, Any], schema: Schema, prefix: str = "", fi
     ``vars`` gives those of a dataclass. Thus a specification that was made or changed in code obeys the rules of one from a file. The
     default of a field needs no check.
 
-    Raises:
-        SpecError: a value of the wrong type or out of its range; the message gives the key and the value as a file would write them.
+    Raises ``SpecError``: a value of the wrong type or out of its range; the message gives the key and the value as a file would write them.
     """
     for key, spec in schema.items():
         name, unit = split_unit(key)

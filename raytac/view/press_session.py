@@ -138,8 +138,8 @@ class PressSession:
 
     def _stage_to(self, name: str) -> tuple[StageSpec | None, int]:
         """Stage and number of states to the target of the control ``name``; None if it is there."""
-        now, wanted = self._places(), self._targets[name]
-        off = wanted - now[name]
+        now, target = self._places(), self._targets[name]
+        off = target - now[name]
         if abs(off) <= _NEAR[name]:
             return None, 0
         if name in ("shear_x", "shear_y"):
@@ -148,11 +148,11 @@ class PressSession:
             distance = np.hypot(ends[0] - now["shear_x"], ends[1] - now["shear_y"])
             return StageSpec("shear", shear=(1e-3 * ends[0], 1e-3 * ends[1])), _steps(distance / _STRIDE_MM)
         if name == "twist":
-            return StageSpec("twist", twist=float(np.radians(wanted))), _steps(off / _TURN_DEG)
+            return StageSpec("twist", twist=float(np.radians(target))), _steps(off / _TURN_DEG)
         steps = _steps(off / (_STRIDE_MM if name == "depth" else _PUSH))
-        if wanted == 0.0:
+        if target == 0.0:
             return StageSpec("release"), steps
-        return (StageSpec("indent", depth=1e-3 * wanted) if name == "depth" else StageSpec("indent", force=wanted)), steps
+        return (StageSpec("indent", depth=1e-3 * target) if name == "depth" else StageSpec("indent", force=target)), steps
 
     def _places(self) -> dict[str, float]:
         """Present value of each control, in its unit."""

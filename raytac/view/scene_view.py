@@ -74,10 +74,10 @@ class SceneView:
         """True if there is anything that ``see_through`` changes."""
         return bool(self._hiding)
 
-    def see_through(self, wanted: bool) -> None:
+    def see_through(self, transparent: bool) -> None:
         """Let the pads be seen through what lies over them, or not."""
         for name, opacity in self._hiding.items():
-            self._solids[name].opacity = min(opacity, _THIN) if wanted else _opacity(opacity)
+            self._solids[name].opacity = min(opacity, _THIN) if transparent else _opacity(opacity)
 
     def draw(self, snapshot: Snapshot, scales: dict[str, ColourScale], quantity: str) -> None:
         """Place and colour everything; ``quantity`` is that of ``scales`` which colours the coats."""

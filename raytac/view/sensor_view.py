@@ -98,15 +98,14 @@ def coat_edges(surface: GelSurface, grid: PadGrid, env: int = 0) -> np.ndarray:
     Args:
         surface: with a coat.
         grid: nodes of ``surface`` that are drawn (from ``strided``).
-        env: environment.
     """
     assert surface.coat is not None
     mesh = surface.coat.mesh
     at = surface.coat.positions[env][:, :2].reshape(*mesh.shape, 2)
     along = np.stack([at[:, :-1], at[:, 1:]], axis=2).reshape(-1, 2, 2)
     ends = np.concatenate([along, np.stack([at[:-1], at[1:]], axis=2).reshape(-1, 2, 2)])
-    wanted = int(np.ceil(max(np.diff(mesh.lines_x).max(), np.diff(mesh.lines_y).max()) / (0.5 * min(grid.pitch))))
-    pieces = max(min(wanted, _MOST_VERTICES // len(ends)), 1)
+    needed = int(np.ceil(max(np.diff(mesh.lines_x).max(), np.diff(mesh.lines_y).max()) / (0.5 * min(grid.pitch))))
+    pieces = max(min(needed, _MOST_VERTICES // len(ends)), 1)
     share = np.linspace(0.0, 1.0, pieces + 1)[:, None]
     points = ends[:, :1] + share * (ends[:, 1:] - ends[:, :1])  # (E, pieces + 1, 2)
     lifted = _on_faces(grid, _thinned_height(surface, grid, env), points) + _CLEAR

@@ -39,8 +39,7 @@ def guarded_server(host: str, port: int, addresses: PageAddresses) -> ViserServe
     are read (``create_connection``). So the two functions of viser that lead there run here as copies in which that one name means
     something else; viser's own modules stay as they are, and so do other servers in this process.
 
-    Raises:
-        BackendError: viser has changed so that the guard is not reached; nothing is served then.
+    Raises ``BackendError``: viser has changed so that the guard is not reached; nothing is served then.
     """
     import viser
     from viser import infra
@@ -201,7 +200,6 @@ def checked_message(raw: bytes | str, element: Callable[[str], Any]) -> bytes:
     """The same message encoded again, from nothing but what was understood of it.
 
     Args:
-        raw: as it came.
         element: the element of a uuid, with its ``value``, and ``options`` or ``min`` and ``max`` if these say what it can be; None if
             there is none (any more), which viser does not mind.
 

@@ -201,8 +201,7 @@ class Session(Protocol):
     def advance(self) -> bool:
         """Compute the next state; False if there was none left to compute.
 
-        Raises:
-            RaytacError: the physics broke down, or cannot go on; the session stays usable after ``reset``.
+        Raises ``RaytacError``: the physics broke down, or cannot go on; the session stays usable after ``reset``.
         """
         ...
 

@@ -34,7 +34,6 @@ class Viewer:
         """Start serving and compute the first state.
 
         Args:
-            session: what is shown.
             host: address to listen at; ``0.0.0.0`` is every network that the machine is in.
             port: in [0, 65535]; 0 lets the system choose.
             allow_hosts: names beside ``host`` that browsers may ask for, as of ``PageAddresses``.

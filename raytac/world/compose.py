@@ -1,4 +1,4 @@
-"""Composition of a task scene to one MuJoCo model: the robot with its sensors, bodies, and the start of all of them."""
+"""Composition of a task scene to one MuJoCo model: robot, sensors, bodies, start."""
 
 from __future__ import annotations
 
@@ -36,10 +36,12 @@ _PLANE = (2.0, 2.0, 0.1)
 """Half widths and grid spacing [m] of the picture of a half-space, which is unbounded."""
 _COLOUR = (0.72, 0.72, 0.7)
 _HARD = 0.2, 0.999
-"""Contacts of rigid bodies beside soft pads: ω Δt of their direct form, and its impedance d. A force F on a mass m penetrates by
-(1 − d) F Δt² / (m 0.2²): 25 µm for a steel ball of 4 g under 1 N at 2 ms, some tenths of a millimetre with MuJoCo's default."""
+"""Contacts of rigid bodies beside soft pads: ω Δt of their direct form, and impedance d.
+
+A force F on a mass m penetrates by (1 − d) F Δt² / (m 0.2²): 25 µm for a steel ball of 4 g under 1 N at 2 ms, some tenths of a millimetre
+with MuJoCo's default."""
 _HARDER = 0.9999
-"""Impedance d of contacts of rigid bodies beside rigid pads (``raytac.world.hard_contacts``)."""
+"""Impedance d of contacts of rigid bodies beside rigid pads (``world.hard_contacts``)."""
 
 
 def compose(scene: TaskScene, physics: str) -> WorldModel:
@@ -285,7 +287,7 @@ def _fingers(model: mujoco.MjModel, opening: int | None) -> np.ndarray:
 
 
 def _balance_servos(model: mujoco.MjModel, start: np.ndarray, ctrl: np.ndarray) -> None:
-    """Set controls (nu,) of position servos to no force at rest at ``start``: g u + b₀ + b₁ l = 0 for the length l."""
+    """Set controls (nu,) of position servos for no force at ``start``: g u + b₀ + b₁ l = 0."""
     data = mujoco.MjData(model)
     data.qpos[:] = start
     mujoco.mj_fwdPosition(model, data)

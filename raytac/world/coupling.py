@@ -1,4 +1,4 @@
-"""Two-way coupling of MuJoCo and a contact solver in turns: forces that stay stable and passive between the solver's steps.
+"""Two-way coupling of MuJoCo and a contact solver by forces that stay stable and passive.
 
 MuJoCo moves links and bodies, the solver moves gels (and bodies of its own). Once every interval T the solver computes the wrench w₀ on
 each of MuJoCo's bodies at its present pose. If w₀ were constant over T, a light finger on a stiff contact would oscillate: staggered
@@ -9,15 +9,16 @@ exchange is stable only while k T² / m is about 1 or less. So within the interv
 for every contact between two bodies: Δ is their relative displacement since w₀ was computed, and K is not less than the contact's true
 stiffness. At the end the solver computes w₀ again, so that K has no part in a state at rest.
 
-*Passive*: let U be the contact's potential energy, with curvature of at most K. Then −w₀ Δ + ½ Δ K Δ ≥ U(x₀ + Δ) − U(x₀): in each interval
-MuJoCo spends at least the energy that the contact stores, whatever T is, and the sum of both energies cannot grow. The excess of K over
-the true stiffness k dissipates ½ Δ (K − k) Δ an interval, like a drag. The energy of a contact in the interval in which it begins is not
-balanced: with a step h of MuJoCo between the last state without and the first with contact, that is up to ½ k (v h)².
+*Passive*: let U be the contact's potential energy, with curvature of at most K. Then −w₀ Δ + ½ Δ K Δ ≥ U(x₀ + Δ) − U(x₀): in each
+interval MuJoCo spends at least the energy that the contact stores, whatever T is, and the sum of both energies cannot grow. The excess of
+K over the true stiffness k dissipates ½ Δ (K − k) Δ an interval, like a drag. The energy of a contact in the interval in which it begins
+is not balanced: with a step h of MuJoCo between the last state without and the first with contact, that is up to ½ k (v h)².
 
 *Bodies that the solver moves* would be dragged along in the same way if they stood still in this law. So each is represented for the
 interval by a rigid body of its mass and velocity, on which w₀, gravity and the other side of each K act.
 
-*In time* the law is taken at the end of MuJoCo's step (backward Euler), for all contacts at once, with the inertia of the whole robot: with
+*In time* the law is taken at the end of MuJoCo's step (backward Euler), for all contacts at once, with the inertia of the whole robot:
+with
 
     v⁺ = v_free + h M⁻¹ Jᵀ c,    c = −K (Δ + h J v⁺)    follows    (1 + h² K A) c = −K (Δ + h J v_free),    A = J M⁻¹ Jᵀ,
 
@@ -40,9 +41,11 @@ if TYPE_CHECKING:
     from raytac.physics.soft.scene import SoftScene
 
 STIFFENING = 2.0
-"""Stiffness assumed of a bonded soft body over that at rest: it stiffens as it is stretched, twisted or sheared (docs/coupling.md)."""
+"""Stiffness assumed of a bonded soft body over that at rest.
+
+It stiffens as it is stretched, twisted or sheared (docs/coupling.md)."""
 _HARD = 2e5
-"""Stiffness of contact between bodies without gel [N/m], as hard as a gel's whole face (a guess)."""
+"""Stiffness of contact between bodies without gel [N/m]: a gel's whole face (a guess)."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class SolverBody:
     velocity: np.ndarray
     """Velocity of the centre of mass [m/s] and angular velocity [rad/s], (6,)."""
     wrench: np.ndarray
-    """Sum of all forces on it, with gravity [N], and of their torques about the centre of mass [N m], (6,)."""
+    """Sum of forces, with gravity [N], and of torques about the centre of mass [N m], (6,)."""
 
 
 @dataclass(frozen=True)
@@ -68,17 +71,20 @@ class CoupledContact:
     body: int | str
     """Body of MuJoCo by its number, or a ``SolverBody`` by its name."""
     stiffness: np.ndarray
-    """K (6, 6), symmetric and positive semi-definite, world axes, for displacements [m] and rotations [rad] about ``point``."""
+    """K (6, 6), symmetric and positive semi-definite, about ``point``, world axes.
+
+    It is for displacements [m] and rotations [rad]."""
     point: np.ndarray
     """Reference point of K [m], world frame, (3,)."""
     other: int | str | None = None
     """The other side, likewise; None: it stands still."""
     normal_force: np.ndarray | None = None
-    """Normal force on ``body`` in w₀ [N], world frame, (3,). The contact opens where K would make it negative. None: it never opens."""
+    """Normal force on ``body`` in w₀ [N], world frame, (3,); opens below 0; None: never opens."""
     wrench: np.ndarray | None = None
-    """Share of this contact in w₀: normal force and friction [N] on ``body`` and their torque about ``point`` [N m], (6,). It vanishes when
-    the contact opens. None: ``normal_force`` alone. It is removed at the displaced point with the torque unchanged: the error is force ×
-    displacement, of second order in an interval."""
+    """Share of this contact in w₀ [N], [N m], (6,); None: ``normal_force`` alone.
+
+    Normal force and friction on ``body`` and their torque about ``point``. It vanishes when the contact opens. It is removed at the
+    displaced point with the torque unchanged: the error is force × displacement, of second order in an interval."""
 
     @property
     def released(self) -> np.ndarray:
@@ -89,7 +95,7 @@ class CoupledContact:
 
 
 CouplingInput = tuple[np.ndarray, list[CoupledContact], dict[str, SolverBody]]
-"""Wrenches (n, 6), contacts and solver bodies of one environment, as ``Coupling.update`` takes them."""
+"""Wrenches (n, 6), contacts and solver bodies of one environment, for ``Coupling.update``."""
 
 
 @dataclass
@@ -100,7 +106,7 @@ class _Interval:
     contacts: Sequence[CoupledContact] = ()
     solver_bodies: dict[str, SolverBody] = field(default_factory=dict)
     anchors: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)
-    """Point of each contact in the frame of its body and in that of the other one (or the world), and their relative rotation."""
+    """Point of each contact in its body and the other (or the world), and relative rotation."""
     displacement: dict[str, np.ndarray] = field(default_factory=dict)
     """Displacement and rotation of each solver body since the beginning, (6,)."""
     speed: dict[str, np.ndarray] = field(default_factory=dict)
@@ -143,7 +149,9 @@ class Coupling:
         contacts: Sequence[CoupledContact] = (),
         solver_bodies: dict[str, SolverBody] | None = None,
     ) -> None:
-        """Begin an interval of environment ``b`` with the solver's result at ``data``'s present poses (after ``mj_kinematics``).
+        """Begin an interval of environment ``b`` at ``data``'s present poses.
+
+        It comes after ``mj_kinematics``, with the solver's result.
 
         Args:
             wrench: w₀ on each body [N], [N m] about the body's frame origin, world axes, (n, 6).
@@ -172,7 +180,7 @@ class Coupling:
         self._intervals[b] = interval
 
     def apply(self, data: mujoco.MjData, b: int) -> None:
-        """Write ``xfrc_applied`` for the coming ``mj_step2``; after ``mj_step1`` and with the controls set."""
+        """Write ``xfrc_applied`` for ``mj_step2``, after ``mj_step1`` and the controls."""
         interval, model = self._intervals[b], self.model
         bodies = list(self.bodies)
         data.xfrc_applied[bodies] = self._at_centre(data, interval.wrench)
@@ -222,13 +230,13 @@ class Coupling:
             interval.displacement[name] = interval.displacement[name] + h * interval.speed[name]
 
     def _at_centre(self, data: mujoco.MjData, wrench: np.ndarray) -> np.ndarray:
-        """Wrenches (n, 6) about the bodies' centres of mass, as MuJoCo takes them, from those about their origins."""
+        """Wrenches (n, 6) about centres of mass, as MuJoCo takes them, from those about origins."""
         arm = data.xpos[list(self.bodies)] - data.xipos[list(self.bodies)]
         return shifted_wrench(wrench, arm)
 
     @staticmethod
     def _frame(data: mujoco.MjData, interval: _Interval, side: int | str | None) -> tuple[np.ndarray, np.ndarray]:
-        """Present rotation (3, 3) and origin (3,) of a side; the axes of a solver body are the world's at the beginning."""
+        """Present rotation (3, 3) and origin (3,) of a side; a solver body began with world axes."""
         if isinstance(side, int):
             return data.xmat[side].reshape(3, 3), data.xpos[side]
         if side is None:
@@ -237,7 +245,7 @@ class Coupling:
         return rotations(displacement[3:]), interval.solver_bodies[side].centre + displacement[:3]
 
     def _motion(self, data: mujoco.MjData, interval: _Interval, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """Contact's point (3,), and displacement (6,) there of the body relative to the other side since the beginning, world axes."""
+        """Contact's point (3,), and motion (6,) of body against other side since the beginning."""
         contact, (anchor, anchor2, rotation) = interval.contacts[k], interval.anchors[k]
         turn, origin = self._frame(data, interval, contact.body)
         turn2, origin2 = self._frame(data, interval, contact.other)
@@ -280,7 +288,7 @@ def _inertia(body: SolverBody) -> np.ndarray:
 
 
 def _point_jacobian(arm: np.ndarray) -> np.ndarray:
-    """Matrix (6, 6) from a rigid body's velocity (v, ω) to that of its point at ``arm`` from the centre: (v + ω × arm, ω)."""
+    """Matrix (6, 6) from a body's velocity (v, ω) to a point's at ``arm``: (v + ω × arm, ω)."""
     x, y, z = arm
     matrix = np.eye(6)
     matrix[:3, 3:] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]

@@ -1,7 +1,7 @@
-"""Environments of one world that differ: masses, friction, gels, and mounting errors of pads.
+"""Environments of one world that differ: masses, friction, gels, mounting errors.
 
-MuJoCo keeps such numbers in its model, of which a world has one for all environments. An environment that differs gets its own copy of the
-scene's model with these numbers changed; quantities that MuJoCo derives from them (inverse weights) are computed again.
+MuJoCo keeps such numbers in its model, of which a world has one for all environments. An environment that differs gets its own copy of
+the scene's model with these numbers changed; quantities that MuJoCo derives from them (inverse weights) are computed again.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ class Variation:
     mass: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Free body to factors (n,) of its mass and inertia."""
     friction: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Body to factors (n,) of its friction coefficients in the scene, against gel and against all else."""
+    """Body to factors (n,) of its friction in the scene, against gel and all else."""
     gel_stiffness: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Sensor to factors (n,) of its gel's Young's modulus."""
     gel_friction: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Sensor to factors (n,) of its gel's own friction coefficient, which applies to bodies without one in the scene."""
+    """Sensor to factors (n,) of its gel's friction, for bodies without one in the scene."""
     mounting: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Sensor to ``nominal_from_pad`` (n, 4, 4): pose of its pad relative to the pad as designed."""
 
 
 class EnvironmentModels:
-    """MuJoCo's models of B environments: the scene's, or a copy for each environment that differs.
+    """MuJoCo's models of B environments: the scene's, or a copy for each that differs.
 
     Attributes:
         inverse_weight: ``body_invweight0`` of translations [1/kg], (B, bodies of the model).

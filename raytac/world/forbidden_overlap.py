@@ -27,7 +27,7 @@ class Inside:
 
 
 class RobotOverlap:
-    """Overlap of the solver's bodies with all geoms of the robot that collide in MuJoCo: cases, links, holders.
+    """Overlap of the solver's bodies with the robot's colliding geoms: cases, links, holders.
 
     The solver has neither cases nor links, so that nothing stops these bodies. Rigid ones are checked at the poses that MuJoCo mirrors,
     meshes by their convex hulls. Soft ones are checked by their surface's vertices, against boxes, balls, capsules, cylinders and

@@ -19,7 +19,7 @@ from raytac.shapes.underside import object_height
 from raytac.specs.sensor import GelpadSpec
 
 _PITCH = 0.8e-3
-"""Spacing of the vertices of a gel's surface [m]: of a dome of 100 mm its facets are off by 1 µm."""
+"""Spacing of the vertices of a gel's surface [m]; a dome of 100 mm is off by 1 µm."""
 
 
 class GelPairs:
@@ -40,7 +40,7 @@ class GelPairs:
         self._modulus = np.array([gel.youngs_modulus for gel in gels])
 
     def press(self, pad: int, height: np.ndarray, grid: PadGrid, world_from_pad: np.ndarray, failed: np.ndarray) -> None:
-        """Lower ``height`` (n, Ny, Nx) to where other gels press that of ``pad``: by its share of the overlap."""
+        """Lower ``height`` (n, Ny, Nx) of ``pad`` by its share of the overlap with other gels."""
         for i, j, _ in self.pairs:
             if pad not in (i, j):
                 continue

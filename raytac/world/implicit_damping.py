@@ -1,4 +1,4 @@
-"""Steps in which the forces of contacts know of the damping that MuJoCo's integrator takes at the end of a step.
+"""Contact forces that know of the damping that MuJoCo's integrator adds at a step's end.
 
 MuJoCo solves for the forces of constraints with the mass matrix M, as if velocities changed by Δt M⁻¹ f. Its integrator then divides by
 M + Δt D with D the damping of joints, tendons and servos. Where Δt D is not small against M, as at a finger of 50 g on a servo with
@@ -49,14 +49,14 @@ class ImplicitDamping:
         self._mass.clear()
 
     def add(self, env: int, model: mujoco.MjModel, data: mujoco.MjData, step: float) -> None:
-        """Add the damping of a step [s] to the mass matrix, after ``mj_fwdActuation`` and before constraints are made."""
+        """Add a step's [s] damping to the mass matrix, after actuation, before constraints."""
         self._mass[env] = data.M.copy()
         data.M[:] += step * self._damping(model, data)
         mujoco.mj_factorM(model, data)
         mujoco.mj_fwdAcceleration(model, data)
 
     def step(self, env: int, model: mujoco.MjModel, data: mujoco.MjData) -> bool:
-        """``mj_step2`` of an environment whose damping was added, which has its own mass matrix after it; False of another one."""
+        """``mj_step2`` where damping was added, restoring the mass matrix; False elsewhere."""
         mass = self._mass.pop(env, None)
         if mass is None:
             return False

@@ -1,4 +1,4 @@
-"""Contact of a world's pads before a step is taken: what MuJoCo's model calls them, and ``GelContact`` of all environments."""
+"""Contact of a world's pads: their names in MuJoCo's model, and ``GelContact``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from raytac.world.hard_contacts import HARD_MARGIN, is_hard
 from raytac.world.world_model import WorldModel
 
 _CASE_TRAVEL = 0.8 * HARD_MARGIN
-"""Greatest travel of a body beside a case in a step [m]: less than the gap from which their contact is known."""
+"""Greatest travel of a body beside a case in a step [m]; below the margin of contacts."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def gel_contact(
     num_envs: int,
     device: str = "cpu",
 ) -> GelContact:
-    """Contacts of B environments with the gels of a world; ``pairs``: of gels that may touch (``GelPairs``)."""
+    """Contacts of B environments with a world's gels; ``pairs``: gels that may touch."""
     model, at = composed.model, PadIndices.of(composed)
     cases = [int(model.geom(mounted.case).id) for mounted in composed.sensors]
     touched = Bodies(

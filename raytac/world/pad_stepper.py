@@ -95,10 +95,9 @@ class PadStepper:
         self._frames.reset(chosen)
 
     def step(self, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData]) -> None:
-        """One step of MuJoCo with the pads' contact, of one state or of B; the controls are in ``data.ctrl``.
+        """One step of MuJoCo with the pads' contact, of one state or B; ``data.ctrl`` is set.
 
-        Raises:
-            InputError: another model, timestep or number of states, or a control that is not finite.
+        Raises ``InputError``: another model, timestep or number of states, or a control that is not finite.
         """
         datas = self._states(model, data)
         self._pads.advance(lambda _: None, self.failed)
@@ -109,8 +108,7 @@ class PadStepper:
 
         Controls and applied forces must have their values of this step: they may close a gap in it.
 
-        Raises:
-            InputError: as ``step``, or no ``finish`` since the last ``add``.
+        Raises ``InputError``: as ``step``, or no ``finish`` since the last ``add``.
         """
         self._states(model, data)
         if self._put is not None:
@@ -121,8 +119,7 @@ class PadStepper:
     def finish(self, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData]) -> None:
         """Read the pads' forces and let the gels shear, after ``mj_step2``.
 
-        Raises:
-            InputError: another model, timestep or number of states, no ``add`` before, or another ``mj_step1`` since.
+        Raises ``InputError``: another model, timestep or number of states, no ``add`` before, or another ``mj_step1`` since.
         """
         datas = checked_states(self.model, model, data, len(self.failed))
         if self._put is None:
@@ -136,7 +133,7 @@ class PadStepper:
         self._time[:] = [one.time for one in datas]
 
     def wrench(self, name: str) -> np.ndarray:
-        """Wrench (B, 6) on a pad about its origin in the last step, pad frame; NaN of a failed state.
+        """Wrench (B, 6) on a pad about its origin in the last step, pad frame; NaN if failed.
 
         Raises ``InputError`` for an unknown sensor.
         """
@@ -149,8 +146,7 @@ class PadStepper:
     ) -> dict[str, TactileFrame]:
         """Frames of the sensor or sensors named (all if None) at the present poses.
 
-        Raises:
-            InputError: another number of states or an unknown sensor; as ``TactileSensor.update``.
+        Raises ``InputError``: another number of states or an unknown sensor; as ``TactileSensor.update``.
         """
         self._engine.bind(checked_states(self.model, self.model, data, len(self.failed)))
         return self._frames.observe(

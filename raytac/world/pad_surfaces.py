@@ -1,4 +1,4 @@
-"""Surfaces of rigid pads among bodies: the underside of what is near, and the elastic surround."""
+"""Surfaces of rigid pads among bodies: undersides and the elastic surround."""
 
 from __future__ import annotations
 
@@ -59,8 +59,6 @@ class PadSurfaces:
         """Reading of one pad in n environments on the nodes of ``grid``.
 
         Args:
-            name: the sensor.
-            grid: nodes of the surface.
             pad_from_body: poses (n, bodies, 4, 4).
             wrench: forces of all that touches (n, 6), as in a ``PadReading``.
             failed: environments that have failed already, (n,).

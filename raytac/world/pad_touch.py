@@ -1,4 +1,4 @@
-"""``PadTouch``: surface and markers of one pad of a world, all environments, on the CPU or on CUDA, without the host."""
+"""``PadTouch``: surface and markers of one pad in all environments, without the host."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from raytac.world.start_kernels import copy_mask, lose_marked
 
 
 class PadTouch:
-    """Heights and markers that ``PadSurfaces`` and ``MarkerTracker`` compute on the host. Another gel that presses is not shown.
+    """Heights and markers of ``PadSurfaces`` and ``MarkerTracker``, on the CPU or on CUDA.
+
+    Another gel that presses is not shown.
 
     Attributes:
         height, contact: as of ``DeviceSurround``.
@@ -42,11 +44,8 @@ class PadTouch:
         Args:
             spec: of the sensor; ``grid``: nodes of its pad.
             bodies: parts of every body, body frame.
-            markers: model of the markers; None is no markers.
             pad: index among the pads of the world.
-            num_envs: number of environments B.
             patches: most separate contacts of the pad, for its markers.
-            device: "cpu" or "cuda".
 
         Raises ``InputError`` as ``DeviceFots``.
         """
@@ -74,7 +73,7 @@ class PadTouch:
             self.fots.launch(self.height, self.contact, poses, self._pad, under.deepest, active, contact.shear.struct)
 
     def reset(self, mask: wp.array) -> None:
-        """Forget what the pads of the environments of a mask (B,), bool, on the device, went through."""
+        """Forget the past of the pads of a mask (B,), bool, on the device."""
         if self.fots is not None:
             self.fots.reset(mask)
 

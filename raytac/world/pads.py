@@ -1,4 +1,4 @@
-"""Pads of a world: what every physics must offer there, and the implementations by the name of the physics."""
+"""Pads of a world: their protocol, and the implementations by name of the physics."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 WORLD_PADS: Registry[Any] = Registry(
     "physics", {"rigid": "raytac.world.rigid_pads:rigid_pads", "ipc": "raytac.world.soft_pads:SoftPads"}
 )
-"""Maker of world pads, called with ``(composed, models, datas, *, physics, coupling, device)``; ``physics`` is the configuration."""
+"""Makers of pads, called with ``(composed, models, datas, *, physics, coupling, device)``.
+
+``physics`` is the configuration."""
 
 
 class WorldPads(Protocol):
@@ -41,7 +43,6 @@ class WorldPads(Protocol):
         """Put environments back to the start, where MuJoCo's states are.
 
         Args:
-            envs: the environments.
             bodies: not None if bodies or the robot start elsewhere: name to poses (n, 4, 4).
 
         Raises:
@@ -50,7 +51,7 @@ class WorldPads(Protocol):
         ...
 
     def advance(self, drive: Drive, failed: np.ndarray) -> None:
-        """One control step of all environments; those that break down are marked in ``failed`` (B,) and stand still."""
+        """One control step; environments that break down are in ``failed`` (B,) and stand still."""
         ...
 
     def wrench(self, name: str) -> np.ndarray:
@@ -58,7 +59,7 @@ class WorldPads(Protocol):
         ...
 
     def reading(self, name: str, grid: PadGrid, failed: np.ndarray, envs: Sequence[int] | None = None) -> PadReading:
-        """Surface and forces of one sensor on the nodes of ``grid``, for the environments named, one row each; None is all."""
+        """Surface and forces of one sensor on ``grid``, a row for each of ``envs`` (None: all)."""
         ...
 
     def overlap(self, env: int) -> list[tuple[str, str, float]]:

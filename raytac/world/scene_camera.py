@@ -1,4 +1,4 @@
-"""Pictures of a world by MuJoCo's renderer: the robot and the bodies, not the image of a sensor."""
+"""Pictures of a world by MuJoCo's renderer, of robot and bodies, not of a sensor."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class SceneCamera:
         self._camera.distance, self._camera.azimuth, self._camera.elevation = distance, azimuth, elevation
 
     def draw(self, env: int = 0, points: Sequence[np.ndarray] = ()) -> np.ndarray:
-        """8-bit picture (H, W, 3) of the present state of an environment; small green balls mark ``points`` (3,) [m].
+        """8-bit picture (H, W, 3) of an environment; small green balls mark ``points`` (3,) [m].
 
         Raises ``InputError`` for an environment that does not exist.
         """

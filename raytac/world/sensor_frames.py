@@ -57,12 +57,11 @@ class SensorFrames:
     def observe(
         self, read: Read, failed: np.ndarray, sensors: Sequence[str] | str | None, envs: np.ndarray | list[int] | None
     ) -> dict[str, TactileFrame]:
-        """Frames of the sensor or sensors named (None: all) in environments (a mask (B,), a list, or None for all).
+        """Frames of the sensors named (None: all) in ``envs`` (mask (B,), list, None for all).
 
         Environments whose surface cannot be are marked in ``failed`` (B,).
 
-        Raises:
-            InputError: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
+        Raises ``InputError``: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
         """
         rows = None if envs is None else chosen_envs(envs, self._num_envs)
         if rows is not None and not rows:

@@ -1,7 +1,8 @@
-"""Soft pads in a MuJoCo world: one contact solver for all gels and the bodies in contact, MuJoCo for the robot and the rest.
+"""Soft pads in a MuJoCo world: one contact solver for all gels and the bodies they touch.
 
-Every ``soft_timestep`` MuJoCo steps first, with the forces of the pads on the robot. Then the solver follows: cases and MuJoCo's bodies are
-driven to MuJoCo's poses, bodies of the solver move freely and are mirrored in MuJoCo as mocap bodies.
+MuJoCo moves the robot and the rest. Every ``soft_timestep`` it steps first, with the forces of the pads on the robot. Then the solver
+follows: cases and MuJoCo's bodies are driven to MuJoCo's poses, bodies of the solver move freely and are mirrored in MuJoCo as mocap
+bodies.
 """
 
 from __future__ import annotations
@@ -44,10 +45,10 @@ _CELLS = 8
 """Cells of a soft body along its longest edge where the scene does not say."""
 
 _INSIDE = 1e-4
-"""Greatest overlap of a body with a case or a link that is not reported [m]: rounding of a scene's lengths."""
+"""Most overlap of a body with a case or link that is not reported [m]: rounding."""
 
 _REPORT = {"min_gap": np.inf, "min_det": 1.0, "blocked": 0.0, "converged": True, "unconverged": 0, "newton": 0, "substeps": 0}
-"""Fields of ``SceneReport`` that a world reports, and their values after a reset, before any step."""
+"""Fields of ``SceneReport`` that a world reports, and their values before any step."""
 
 
 class SoftPads:
@@ -63,7 +64,7 @@ class SoftPads:
         coupling: str,
         device: str,
     ) -> None:
-        """Put the pads of all environments into the solver where MuJoCo has them; ``coupling``: one of ``COUPLINGS``.
+        """Put all pads into the solver where MuJoCo has them; ``coupling``: of ``COUPLINGS``.
 
         Raises:
             BackendError: the solver is not installed, or the device does not work here.
@@ -121,8 +122,7 @@ class SoftPads:
         ``bodies``: not None if they or the robot start elsewhere: name to poses (n, 4, 4) of the environments named; the cases are where
         MuJoCo has them.
 
-        Raises:
-            OverlapError: bodies overlap there; the solver has not changed then, what MuJoCo shows of its bodies has.
+        Raises ``OverlapError``: bodies overlap there; the solver has not changed then, what MuJoCo shows of its bodies has.
         """
         datas = self._datas
         cases, chosen = self._pad_poses(datas), list(envs)
@@ -151,13 +151,13 @@ class SoftPads:
             self._mirror(datas, [b])
 
     def advance(self, drive: Drive, failed: np.ndarray) -> None:
-        """Take one control step of all environments; those that fail are marked in ``failed`` (B,) and stand still.
+        """Take one control step of all environments; failures are marked in ``failed`` (B,).
 
+        Those that fail stand still.
         An environment fails if its state is not finite, if its last step did not meet the solver's tolerance, or, with a
         ``RuntimeWarning``, if it moves too fast to be resolved near a contact.
 
-        Raises:
-            InputError: the only environment moves too fast; it has failed then, until it is reset.
+        Raises ``InputError``: the only environment moves too fast; it has failed then, until it is reset.
         """
         scene, timestep, datas = self._scene, self.composed.timestep, self._datas
         interval, since, reports = round(scene.soft_timestep / timestep), 0, []
@@ -215,7 +215,7 @@ class SoftPads:
         return []
 
     def _prepare_bonded(self) -> None:
-        """Invert the stiffness of bonded soft bodies here, not in the step that first touches them (see ``coupling_inputs``)."""
+        """Invert the stiffness of bonded soft bodies now, for ``coupling_inputs`` at first touch."""
         scene = self._scene
         for i, body in enumerate(scene.bodies):
             if body.held_by is None:
@@ -240,7 +240,7 @@ class SoftPads:
         return True
 
     def _now(self, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """MuJoCo's poses of cases and of its own bodies; an environment that failed keeps its last ones."""
+        """MuJoCo's poses of cases and of its bodies; failed environments keep their last ones."""
         cases = np.where(failed[:, None, None, None], self._last_cases, self._pad_poses(datas))
         now = {body.name: body_poses(datas, body.index) for body in self._driven}
         return cases, {name: np.where(failed[:, None, None], self._last_driven[name], pose) for name, pose in now.items()}
@@ -287,7 +287,7 @@ class SoftPads:
     def _inside(
         self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | range | np.ndarray, *, only_rigid: bool = False
     ) -> Iterator[tuple[int, Inside]]:
-        """Overlaps with cases and links, by environment: of rigid bodies as mirrored in MuJoCo, of soft ones by their vertices."""
+        """Overlaps with cases and links by environment: rigid bodies in MuJoCo, soft by vertices."""
         soft = {name: self.soft.mesh(name)[0] for name, body in self.soft.bodies.items() if body.is_soft and not only_rigid}
         for b in envs:
             overlaps = self._robot.rigid(datas[b])
@@ -345,13 +345,13 @@ def _solver_body(scene: TaskScene, index: int) -> SceneBody:
 
 
 def _pair_friction(scene: TaskScene) -> dict[tuple[str, str], float]:
-    """Coefficients between bodies: the larger of both, as in MuJoCo; with pads the solver's own rule applies."""
+    """Coefficients between bodies, the larger of both, as in MuJoCo; pads follow the solver."""
     known = {b.name: PAIR_FRICTION if b.friction is None else b.friction for b in scene.bodies}
     return {(a, b): max(known[a], known[b]) for a, b in combinations(known, 2)}
 
 
 def _bonded_vertices(scene: TaskScene, index: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Function that selects the vertices (n, 3) of a soft body, in its frame, that are bonded to its holder."""
+    """Function that selects a soft body's vertices (n, 3), in its frame, bonded to its holder."""
     body = scene.bodies[index]
     fixed = scene.body(str(body.held_by))
     fixed_from_body = np.linalg.inv(pose_of(fixed.position, fixed.quaternion)) @ pose_of(body.position, body.quaternion)

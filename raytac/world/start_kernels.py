@@ -19,7 +19,7 @@ def place_body(
     # outputs
     qpos: wp.array2d(dtype=wp.float32),
 ):
-    """Write poses (B, 4, 4) of a free body to its positions from ``address`` on: place and quaternion."""
+    """Write poses (B, 4, 4) of a free body from ``address`` on, as place and quaternion."""
     i = wp.tid()
     turn = wp.mat33d()
     for row in range(3):
@@ -41,7 +41,7 @@ def aim_at_positions(
     target: wp.array2d(dtype=wp.float64),
     target_speed: wp.array2d(dtype=wp.float64),
 ):
-    """Let joints of the environments that are ``chosen`` hold where ``qpos`` has them; ``joints`` (n,): their addresses."""
+    """Let joints (n,), by address, of ``chosen`` environments hold where ``qpos`` has them."""
     i, k = wp.tid()
     if chosen[i]:
         target[i, k] = wp.float64(qpos[i, joints[k]])

@@ -1,4 +1,4 @@
-"""``TactileReader``: frames of sensors from states of MuJoCo that somebody else steps, with MuJoCo's own contacts."""
+"""``TactileReader``: frames from MuJoCo states that the user steps, by MuJoCo's contacts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from raytac.world.touched import TouchChoice
 
 DEPTHS = ("force", "geometry")
-"""Depths of an imprint: that at which the gel's load law gives MuJoCo's normal force, or the overlap that MuJoCo's state has."""
+"""Depths of an imprint: where the load law gives MuJoCo's force, or MuJoCo's overlap."""
 _HALVINGS = 50
 
 
@@ -105,7 +105,7 @@ class TactileReader:
         }
 
     def reset(self, envs: np.ndarray | list[int] | None = None) -> None:
-        """Forget the history of markers in states (a mask (B,), a list, or None for all), at the beginning of an episode.
+        """Forget markers' history in states (mask (B,), list, None for all), for an episode.
 
         Raises ``InputError`` for a state that does not exist.
         """
@@ -118,8 +118,7 @@ class TactileReader:
     ) -> dict[str, TactileFrame]:
         """Frames of the sensor or sensors named (all if None), a row for each state.
 
-        Raises:
-            InputError: another number of states, states of another model, or an unknown sensor; as ``TactileSensor.update``.
+        Raises ``InputError``: another number of states, states of another model, or an unknown sensor; as ``TactileSensor.update``.
         """
         states = checked_states(self.model, self.model, datas, len(self.failed))
         self.failed[:] = [not np.isfinite(data.qpos.sum() + data.qvel.sum()) for data in states]
@@ -164,7 +163,7 @@ class TactileReader:
         return wrench, load
 
     def _settle(self, mounted: MountedSensor, pad_from_body: np.ndarray, load: np.ndarray, failed: np.ndarray) -> None:
-        """Move bodies along the pad's z, in place, until the load law gives their loads (B, groups) [N]."""
+        """Move bodies along z, in place, until the law gives their loads (B, groups) [N]."""
         sound, gelpad = np.flatnonzero(~failed), mounted.spec.gelpad
         firsts = [int(group[0]) for group in self._groups.values()]
         poses = pad_from_body[sound][:, None, firsts]

@@ -15,7 +15,7 @@ from raytac.robots.mount import MountedSensor
 from raytac.shapes.part import Part, mesh_part
 
 TouchChoice = Sequence[str] | Mapping[str, float | None]
-"""Names of bodies or geoms that pads touch; a mapping has their friction coefficients against gel, None for the gel's own."""
+"""Names of bodies or geoms that pads touch; a mapping has friction, None the gel's own."""
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,7 @@ def touched_bodies(
     triangles. A name that no body has is that of one geom, which may be one that is only looked at, as the finer shape often is.
 
     Args:
-        model: the model.
         touches: names of bodies or geoms; None is every body with a free joint that carries no sensor.
-        sensors: the model's sensors.
 
     Raises:
         InputError: a name that no body and no geom has or that comes twice, a body that is part of a sensor or fixed to it, no geom that

@@ -1,4 +1,7 @@
-"""``WarpWorld``: a task scene with rigid pads on MuJoCo Warp, thousands of environments on one GPU, driven by its arm's joints or tool."""
+"""``WarpWorld``: a task scene with rigid pads on MuJoCo Warp, driven by joints or tool.
+
+Thousands of environments run on one GPU.
+"""
 
 from __future__ import annotations
 
@@ -33,10 +36,12 @@ _SPRINGS = ("joints", "speed", "bias", "mass")
 
 
 class WarpWorld:
-    """B environments of a model with rigid pads. Arms with torque motors follow targets by springs, of the law of ``JointImpedance``.
+    """B environments of a model with rigid pads; arms with torque motors follow targets by springs.
 
-    A control step is launched without waiting for the device, on CUDA as one graph. An environment in which physics breaks down, or a body
-    goes through a pad, is no longer active until it is reset.
+    The springs obey the law of ``JointImpedance``.
+
+    A control step is launched without waiting for the device, on CUDA as one graph. An environment in which physics breaks down, or a
+    body goes through a pad, is no longer active until it is reset.
 
     Attributes:
         composed: names and indices of the scene's parts in the model.
@@ -64,7 +69,6 @@ class WarpWorld:
         Args:
             scene: name of a shipped task scene, path of a scene file, a scene, or a composed model, which may do without an arm: it
                 follows no targets then.
-            num_envs: number of environments B.
             device: "auto", "cpu" or "cuda".
             frequency: of the springs in the joints [rad/s].
             launches: steps of MuJoCo in a control step, as many as the scene's if None. Of more a world divides one in which something
@@ -133,27 +137,27 @@ class WarpWorld:
 
     @property
     def target(self) -> wp.array:
-        """Targets of the arm's joints (B, n), float64, to be written in place; at the start where the joints are."""
+        """Targets of the arm's joints (B, n), float64, to write in place; at the start the joints."""
         return self._springs.target
 
     @property
     def target_speed(self) -> wp.array:
-        """Speeds of the joints' targets in a control step (B, n), float64, to be written in place; 0 at the start."""
+        """Speeds of the joints' targets in a step (B, n), float64, to write in place; first 0."""
         return self._springs.target_speed
 
     @property
     def tool_target(self) -> wp.array:
-        """Poses (B, 4, 4) that the tools are to have at the start of a control step, float64, to be written in place; for ``aim``."""
+        """Poses (B, 4, 4) of the tools at the start of a step, float64, to write; for ``aim``."""
         return self._servo.target
 
     @property
     def tool_twist(self) -> wp.array:
-        """Their velocities in the step (B, 6) [m/s, rad/s], world axes, float64, to be written in place; for ``aim``."""
+        """Their velocities in the step (B, 6) [m/s, rad/s], world axes, to write; for ``aim``."""
         return self._servo.twist
 
     @property
     def opening(self) -> wp.array | None:
-        """Commanded gap between two pads (B, 1) [m], float64, to be written in place; None without a gripper."""
+        """Commanded gap between two pads (B, 1) [m], float64, to write; None without a gripper."""
         return self._opening
 
     def reset(
@@ -206,10 +210,9 @@ class WarpWorld:
         self._reader.read()
 
     def step(self, controls: wp.array | None = None) -> None:
-        """One control step of all environments that are active.
+        """One control step of active environments towards ``target``, at ``target_speed``.
 
-        Joints move towards ``target``, which moves with ``target_speed`` in it; with ``controls`` (B, nu), float32, on the device the
-        actuators have these instead.
+        With ``controls`` (B, nu), float32, on the device the actuators have these instead.
         """
         held = controls is None
         if controls is not None:
@@ -231,11 +234,14 @@ class WarpWorld:
         self.step()
 
     def aim(self) -> None:
-        """Launch the inverse kinematics: ``target`` and ``target_speed`` from ``tool_target`` and ``tool_twist`` (``PoseServo``)."""
+        """Launch the inverse kinematics (``PoseServo``): from the tool's targets to the joints'."""
         self._launch(servo_step, self.engine.num_envs, [self._servo])
 
     def launch(self, *, held: bool = True) -> None:
-        """Launch a control step, as ``step`` records it: for a graph that does more. ``held``: by springs, not by constant controls."""
+        """Launch a control step, as ``step`` records it: for a graph that does more.
+
+        ``held``: by springs, not by constant controls.
+        """
         drive = self.drive if held else _leave
         self.engine.advance(drive, scene_steps=self._steps, launches=self._launches)
         self.engine.finish()

@@ -1,4 +1,4 @@
-"""``TactileWorld``: a task scene or a MuJoCo model of one's own, stepped with its pads, and read by tactile sensors."""
+"""``TactileWorld``: a task scene or a user's MuJoCo model, with pads and sensors."""
 
 from __future__ import annotations
 
@@ -43,7 +43,9 @@ _OVERLAP = 1e-4
 """Greatest overlap of rigid bodies at the start [m]: rounding of a scene's lengths."""
 
 _BEYOND = 1e-2
-"""Greatest excess of joints over their range at the start [rad or m]. MuJoCo's limits are soft, and a start may be recorded at one."""
+"""Greatest excess of joints over their range at the start [rad or m].
+
+MuJoCo's limits are soft, and a start may be recorded at one."""
 
 
 class TactileWorld:
@@ -93,7 +95,9 @@ class TactileWorld:
         seed: int = 0,
         pitch: float | None = None,
     ) -> None:
-        """Compose the scene and put it at its start; sensors are made on first use, their settings are checked here.
+        """Compose the scene and put it at its start; sensors are made on first use.
+
+        Their settings are checked here.
 
         Args:
             scene: name of a shipped task scene, path of a scene file, or a scene; or a ``MjSpec`` or ``MjModel`` with sensors that
@@ -205,7 +209,7 @@ class TactileWorld:
         self.close()
 
     def close(self) -> None:
-        """Do nothing, any number of times: memory and kernels go with the last reference, and no file, thread or window is held."""
+        """Do nothing, any number of times: memory goes with the last reference, nothing is held."""
 
     @property
     def data(self) -> tuple[mujoco.MjData, ...]:
@@ -240,10 +244,10 @@ class TactileWorld:
         bodies: Mapping[str, np.ndarray] | None = None,
         variation: Variation | None = None,
     ) -> WorldState:
-        """Put environments (a mask (B,), a list, or None for all) back to the start: joints, bodies, pads, markers and time.
+        """Put environments back to the start: joints, bodies, pads, markers and time.
 
         Args:
-            envs: n environments.
+            envs: n environments: a mask (B,), a list, or None for all.
             joints: other starts of the arm's joints (n, joints) [rad or m].
             bodies: other starts of free bodies and of mocap bodies: name to ``world_from_body`` (n, 4, 4).
             variation: differences of these environments from the scene from now on. None keeps the present ones, ``Variation()`` removes
@@ -319,7 +323,7 @@ class TactileWorld:
         return self._states.failed.copy()
 
     def hold(self, data: mujoco.MjData, time: float) -> None:
-        """Controller that keeps the robot of a scene at its start; a model of one's own keeps its present controls."""
+        """Controller that keeps a scene's robot at its start, and another model's controls."""
         self._states.hold(data)
 
     def state(self) -> WorldState:
@@ -337,15 +341,15 @@ class TactileWorld:
     def observe(
         self, sensors: Sequence[str] | str | None = None, envs: np.ndarray | list[int] | None = None
     ) -> dict[str, TactileFrame]:
-        """Frames of the sensor or sensors named (all if None), of all environments at once; images and markers are computed here.
+        """Frames of the sensors named (all if None), of all environments at once.
 
+        Images and markers are computed here.
         Markers that depend on a contact's history (``fots``) use only the states that are observed: observe them in every control step.
 
         ``envs`` (a mask (B,) or a list) gives frames with one row for each environment named. For the others no noise is drawn and no
         history is written. One that is named twice has two equal rows.
 
-        Raises:
-            InputError: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
+        Raises ``InputError``: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
         """
         failed = self._states.failed.copy()
         try:
@@ -356,7 +360,7 @@ class TactileWorld:
             self._states.fail(failed)
 
     def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Present surface of a body or of a soft pad: vertices (B, n, 3) [m], world frame, and faces (F, 3).
+        """Present surface of a body or soft pad: vertices (B, n, 3) [m], world, and faces (F, 3).
 
         Raises ``InputError`` for an unknown name, or a half-space, which is unbounded.
         """
@@ -381,7 +385,10 @@ class TactileWorld:
         return f"; it is {size:.3g} m large: are its units metres?" if size > 1.0 else ""
 
     def _check_start(self) -> None:
-        """Raise ``InputError`` for a start in which bodies overlap; a model of one's own may start in contact, but not through a pad."""
+        """Raise ``InputError`` for a start in which bodies overlap.
+
+        A user's own model may start in contact, but not through a pad.
+        """
         data, model = self._states.first(), self.model
         for contact in data.contact[: data.ncon]:
             if contact.dist < -_OVERLAP and self.scene is not None:

@@ -1,4 +1,4 @@
-"""Model of a world: what a task scene and a user's own MuJoCo model both become before they are stepped."""
+"""Model of a world, made from a task scene or a user's own MuJoCo model."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from raytac.specs.task import TaskScene
 from raytac.world.touched import TouchChoice, TouchedBody, touched_bodies
 
 _OVERLAP = 1e-4
-"""Greatest depth to which a gel may lie in the robot at the start [m]: rounding of a model's lengths."""
+"""Greatest depth of a gel in the robot at the start [m]: rounding of a model's lengths."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,9 @@ class WorldModel:
     start: np.ndarray
     """Positions (nq,) at the start."""
     ctrl: np.ndarray
-    """Controls (nu,) at the start: a keyframe's; of a task scene those with which position actuators keep the start and motors are idle."""
+    """Controls (nu,) at the start: a keyframe's, or those that keep a task scene's start.
+
+    Position actuators keep it, motors are idle."""
     key: int = -1
     """Keyframe from which speeds, activations and mocap bodies start too; −1: none."""
     scene: TaskScene | None = None
@@ -67,7 +69,7 @@ class WorldModel:
 
 
 def compiled_model(source: mujoco.MjSpec | mujoco.MjModel) -> mujoco.MjModel:
-    """The model itself, or the one that a spec compiles to; raises ``InputError`` where MuJoCo refuses it."""
+    """The model itself, or a spec's; raises ``InputError`` where MuJoCo refuses it."""
     if isinstance(source, mujoco.MjModel):
         return source
     try:
@@ -130,7 +132,7 @@ def own_world_model(
 
 
 def _check_options(model: mujoco.MjModel) -> None:
-    """Refuse options of MuJoCo under which a pad's contact would not act, or not as its law says."""
+    """Refuse options under which a pad's contact would not act as its law says."""
     option = model.opt
     if option.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         rule = "takes no contacts between mj_step1 and mj_step2: set spec.option.integrator, or integrator= in the file"
@@ -167,7 +169,7 @@ def _check_collisions(model: mujoco.MjModel, sensors: Sequence[MountedSensor], o
 def checked_states(
     own: mujoco.MjModel, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData], count: int
 ) -> list[mujoco.MjData]:
-    """One state or several as a list; raises ``InputError`` for another model than one's ``own``, or not ``count`` states."""
+    """One state or several as a list; raises ``InputError`` unless ``count`` of ``own``."""
     if model is not own:
         raise InputError("model", value=type(model).__name__, rule="must be the model that this was made for")
     datas: list[Any] = [data] if isinstance(data, mujoco.MjData) else list(data)

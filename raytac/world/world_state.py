@@ -13,11 +13,13 @@ from raytac.errors import InputError
 from raytac.gel.surface import summary
 
 LARGEST_SPEED = 1e4
-"""Joint speed [rad/s or m/s] beyond which an environment counts as failed, long before MuJoCo sees a huge number."""
+"""Joint speed [rad/s or m/s] beyond which an environment counts as failed."""
 
 Controller = Callable[[mujoco.MjData, float], None]
-"""Writes ``data.ctrl`` of one environment, given the time since the reset [s]; called in every step of MuJoCo, when positions, velocities
-and bias forces are up to date, and before the contacts of rigid pads are found, which may close by these very controls."""
+"""Function that writes ``data.ctrl`` of one environment at a time since the reset [s].
+
+It is called in every step of MuJoCo, when positions, velocities and bias forces are up to date, and before the contacts of rigid pads are
+computed, which may close by these very controls."""
 Drive = Callable[[Sequence[int] | np.ndarray], None]
 """Writes ``data.ctrl`` of the environments named, at the same moments."""
 
@@ -27,16 +29,19 @@ class BatchController(ABC):
 
     @abstractmethod
     def drive(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray) -> None:
-        """Write ``ctrl`` of ``datas[b]`` for every b of ``envs``, when a ``Controller`` would be called; the others have failed."""
+        """Write ``ctrl`` of ``datas[b]`` for b of ``envs``, as a ``Controller``; others have failed."""
 
 
 Control = Controller | BatchController | Sequence[Controller] | np.ndarray
-"""Controllers of a world: one for all environments, one for each, or constant controls (nu,) or (B, nu)."""
+"""Controllers of a world: one for all, one each, or constant controls (nu,) or (B, nu)."""
 
 
 @dataclass(frozen=True)
 class WorldState:
-    """B environments at one instant, world frame unless said otherwise. An environment that failed holds NaN."""
+    """B environments at one instant, world frame unless said otherwise.
+
+    An environment that failed holds NaN.
+    """
 
     time: np.ndarray
     """Time since the reset [s], shape (B,)."""
@@ -47,9 +52,9 @@ class WorldState:
     world_from_body: dict[str, np.ndarray]
     """Pose (B, 4, 4) of every rigid body."""
     wrench: dict[str, np.ndarray]
-    """Contact force on each pad [N] and its torque about the pad frame's origin [N m], **pad frame**, shape (B, 6)."""
+    """Contact force [N] and torque about the origin [N m] on each pad, **pad frame**, (B, 6)."""
     failed: np.ndarray
-    """Environments whose physics broke down, shape (B,), bool; they stand still until they are reset."""
+    """Environments whose physics broke down, (B,), bool; they stand still until reset."""
     report: dict[str, np.ndarray] = field(default_factory=dict)
     """Report of the pads' solver on this step, each (B,); empty with the rigid pad."""
 
@@ -75,7 +80,7 @@ def constant_controls(control: np.ndarray, num_envs: int, count: int) -> np.ndar
 
 
 def lost(datas: Sequence[mujoco.MjData]) -> np.ndarray:
-    """True (n,) for states of MuJoCo that are invalid: a number is not finite, or a joint is far too fast."""
+    """True (n,) for states of MuJoCo that are not finite or have a joint far too fast."""
     speed, position = np.array([data.qvel for data in datas]), np.array([data.qpos for data in datas])
     # One number that is not finite makes the sum such.
     return np.logical_not((np.abs(speed).max(axis=1, initial=0.0) < LARGEST_SPEED) & np.isfinite(position.sum(axis=1)))

@@ -29,7 +29,7 @@ from raytac.envs.action_targets import ToolTargets, joint_targets
 from raytac.envs.insert_peg import SOCKET
 from raytac.envs.open_drawer import HANDLE
 from raytac.envs.task_observation import body_from_tool, state_and_goal
-from raytac.envs.task_outcome import task_outcome
+from raytac.envs.task_progress import task_outcome
 from raytac.robots.pose_errors import PoseErrors
 from raytac.se3 import pose, pose_error
 

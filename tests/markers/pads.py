@@ -11,7 +11,8 @@ from raytac.gel.coat_mesh import CoatMesh, DeformedCoat
 from raytac.gel.surface import GelSurface, PadGrid, make_grid
 from raytac.markers.calibration_presses import Press, PressFrame
 from raytac.markers.config import Fots
-from raytac.markers.contacts import ContactCells, ContactTracker
+from raytac.markers.contact_tracker import ContactTracker
+from raytac.markers.contacts import ContactCells
 from raytac.specs import MarkerMotionSpec, SensorSpec, load_sensor
 
 PITCH = 0.1e-3

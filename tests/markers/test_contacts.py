@@ -11,7 +11,8 @@ from scipy import ndimage
 from raytac.errors import InputError
 from raytac.gel.components import find_runs, join_runs
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.markers.contacts import ContactCells, Contacts, ContactTracker
+from raytac.markers.contact_tracker import ContactTracker
+from raytac.markers.contacts import ContactCells, Contacts
 from tests.markers.pads import pose, pressed
 
 DEEP = 5e-4

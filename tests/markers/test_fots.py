@@ -12,7 +12,8 @@ from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.markers.base import MarkerModel
 from raytac.markers.config import Fots
-from raytac.markers.contacts import ContactCells, ContactTracker
+from raytac.markers.contact_tracker import ContactTracker
+from raytac.markers.contacts import ContactCells
 from raytac.markers.pattern import marker_centres
 from raytac.markers.tracker import MarkerTracker
 from raytac.specs import SensorSpec, load_sensor

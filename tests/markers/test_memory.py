@@ -10,7 +10,8 @@ import pytest
 from raytac.gel.contact_shear import ContactShear
 from raytac.gel.surface import GelSurface, PadGrid, make_grid
 from raytac.markers.config import Fots, FotsPublished, Superposition
-from raytac.markers.contacts import TWIST_SLIP, ContactCells, ContactTracker
+from raytac.markers.contact_tracker import ContactTracker
+from raytac.markers.contacts import TWIST_SLIP, ContactCells
 from raytac.markers.tracker import MarkerTracker
 from raytac.specs import BodySpec, RobotSpec, TaskScene, load_sensor
 from raytac.world.world import TactileWorld

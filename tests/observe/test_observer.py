@@ -8,6 +8,7 @@ import pytest
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.gel.surface import GelSurface, make_grid
+from raytac.gel.traction import cell_areas, foundation_traction
 from raytac.markers import Fots, MarkerFrame, MarkerPerturbation
 from raytac.observe import MODALITIES, ObservationSettings, Randomization, TactileObserver, gymnasium_space, randomised_sensor
 from raytac.observe.observer import CellMeans
@@ -35,7 +36,8 @@ def frame(step: int = 0, failed: tuple[int, ...] = (), size: tuple[int, int] = (
     surface = GelSurface(GRID, height.astype(np.float32), contact, np.zeros((B, 2)))
     wrench = np.where(flags[:, None], np.nan, np.arange(6.0) + step)
     rgb = rng.integers(0, 256, (B, size[1], size[0], 3), np.uint8)
-    return TactileFrame(surface, rgb=rgb, markers=markers, wrench=wrench, failed=flags)
+    traction = foundation_traction(surface, wrench[:, :3], wrench[:, 5])
+    return TactileFrame(surface, rgb=rgb, markers=markers, traction=traction, wrench=wrench, failed=flags)
 
 
 def rows_of(whole: TactileFrame, rows: list[int]) -> TactileFrame:
@@ -43,7 +45,8 @@ def rows_of(whole: TactileFrame, rows: list[int]) -> TactileFrame:
     surface, markers = whole.surface, whole.markers
     assert markers is not None and whole.rgb is not None and whole.wrench is not None and whole.failed is not None
     return TactileFrame(
-        GelSurface(GRID, surface.height[rows], surface.contact[rows], surface.contact_centre[rows]),
+        traction=whole.traction[rows],
+        surface=GelSurface(GRID, surface.height[rows], surface.contact[rows], surface.contact_centre[rows]),
         rgb=whole.rgb[rows],
         markers=MarkerFrame(*(values[rows] for values in vars(markers).values())),
         wrench=whole.wrench[rows],
@@ -91,6 +94,18 @@ def test_cells_are_means_of_the_nodes_in_them() -> None:
         CellMeans((7, 10), (8, 4))
     found = observer("contact", map_shape=(4, 5)).observe(frame())["contact"]
     assert GRID.shape == (53, 64) and found[0, 0, 0] == pytest.approx(10 * 5 / (13 * 12)) and found[0, -1, -1] == 0.0
+
+
+def test_traction_adds_up_to_the_force() -> None:
+    given = frame(2)
+    seen = observer("traction", map_shape=GRID.shape, normalise=False)
+    assert seen.sensor_options()["outputs"] == ("traction",)
+    found = seen.observe(given)["traction"]
+    total = (found * cell_areas(GRID)[None, ..., None]).sum(axis=(1, 2))
+    np.testing.assert_allclose(total, given.wrench[:, :3], rtol=1e-4)
+    coarse = observer("traction", map_shape=(4, 5)).observe(given)["traction"]
+    assert coarse.shape == (B, 4, 5, 3) and np.abs(coarse[..., 2]).argmax(axis=(1)).max() == 0  # the contact is in a corner
+    np.testing.assert_allclose(coarse[..., 2], 1e-4 * CellMeans(GRID.shape, (4, 5))(found[..., 2]), rtol=1e-5)
 
 
 def test_stack_holds_the_last_frames_oldest_first_and_begins_anew_where_told() -> None:

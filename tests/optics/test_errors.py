@@ -82,6 +82,14 @@ def test_without_llvm_the_error_says_how_to_mend_it(monkeypatch: pytest.MonkeyPa
         load_mitsuba("cpu")
 
 
+def test_an_llvm_that_was_loaded_before_and_is_too_old_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It aborts the process in the first kernel."""
+    monkeypatch.setattr("raytac.optics.runtime.LLVM_NAMED_BY_USER", False)
+    monkeypatch.setattr("drjit.detail.llvm_version", lambda: (15, 0, 6))
+    with pytest.raises(BackendError, match=r"libLLVM 15\.0\.6.*imported before raytac: import raytac\.optics first"):
+        load_mitsuba("cpu")
+
+
 def test_another_rest_surface_is_refused(tracer: Build) -> None:
     spec = sensor([led("one", (0.0, -11e-3, -9e-3))])
     mode = tracer(spec, bounce=False)

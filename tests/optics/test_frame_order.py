@@ -20,7 +20,8 @@ import pytest
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.markers.base import MarkerModel
 from raytac.markers.config import Fots
-from raytac.markers.contacts import ContactCells, ContactTracker
+from raytac.markers.contact_tracker import ContactTracker
+from raytac.markers.contacts import ContactCells
 from raytac.markers.registry import MARKERS
 from raytac.markers.tracker import MarkerTracker
 from raytac.optics import Mlp, Phong, RayTraced, Taxim

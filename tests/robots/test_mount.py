@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -68,6 +69,19 @@ def test_case_and_gel_have_the_sensors_size_and_weight():
     spec = mujoco.MjSpec.from_string(ROBOT)
     mount(spec, sensor, body="base", mass=0.05)
     assert spec.compile().body_mass.sum() - before == pytest.approx(0.05, rel=1e-9)
+
+
+def test_walls_and_density_of_the_case_are_the_sensors_own():
+    mini = load_sensor("gelsight_mini")
+    sensor = replace(mini, case=replace(mini.case, wall=2e-3, density=2000.0))
+    spec = mujoco.MjSpec.from_string(ROBOT)
+    before = spec.compile().body_mass.sum()
+    mounted = mount(spec, sensor, body="base")
+    model = spec.compile()
+    size = np.array([0.0344, 0.0304, 0.0285 + 2e-3 - 0.004])
+    np.testing.assert_allclose(2 * model.geom(mounted.case).size, size, atol=1e-12)
+    assert model.body_mass.sum() - before == pytest.approx(size.prod() * 2000 + 0.02525 * 0.02075 * 0.004 * 1000, rel=1e-9)
+    np.testing.assert_allclose(standing_on(sensor)[2, 3], 0.0305, atol=1e-12)
 
 
 def test_a_sensor_stands_on_its_mount_by_default():

@@ -246,6 +246,24 @@ def cube_on(share: float, mu: float = 0.6, timestep: float = 0.01, num_envs: int
     return TactileWorld(replace(scene, timestep=timestep, control_timestep=0.01), outputs=(), num_envs=num_envs)
 
 
+@pytest.mark.parametrize(
+    ("share", "mu", "edge", "height", "mass", "gap"),
+    [(0.86, 0.66, 0.01358, 0.00349, 0.045, 0.79e-3), (0.9, 0.98, 0.01086, 0.00311, 0.19, 0.1e-3)],
+)
+def test_a_plate_that_rocks_as_it_lands_comes_to_rest(
+    share: float, mu: float, edge: float, height: float, mass: float, gap: float
+) -> None:
+    """Its middle closes slowly and its rim fast, which a step of 10 ms does not resolve."""
+    plate = BodySpec("plate", "box", {"length": edge, "width": edge, "height": height}, position=(0.0, 0.0, 0.5 * height + gap))
+    pull = G * np.array([share * mu, 0.0, -1.0]) / np.hypot(1.0, share * mu)
+    scene = TaskScene("tilt", RobotSpec("fixed_sensor"), (replace(plate, friction=mu, mass=mass),), gravity=tuple(pull.tolist()))
+    world = TactileWorld(replace(scene, timestep=0.01, control_timestep=0.01), outputs=())
+    for _ in range(80):
+        world.step()
+    assert np.abs(world.data[0].qvel).max() < 1e-3
+    assert np.abs(world.data[0].qpos[0]) < 4e-3
+
+
 @pytest.mark.parametrize("mu", [0.2, 1.0])
 def test_at_nine_tenths_of_the_slip_limit_a_body_does_not_creep(mu: float) -> None:
     world = cube_on(0.9, mu)

@@ -113,7 +113,7 @@ def test_markers_follow_contacts_as_on_the_host(markers: str, device: str) -> No
         assert error.max() < 1e-9
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-8, err_msg=str(step))
         most = max(most, float(np.abs(expected).max()))
-        contacts.add(int(both.fots._table.numpy()[0, :, 0].sum()))
+        contacts.add(int(both.fots.contacts.table.numpy()[0, :, 0].sum()))
     assert most > 2e-4 and contacts == {0, 1, 2}
     both.fots.check()
 

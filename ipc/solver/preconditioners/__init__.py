@@ -46,8 +46,7 @@ def make_preconditioner(layout: Layout, settings: Settings, batch: int, lanes: i
 
     Its products of matrices add up in another order for another number of environments, so a deterministic world does without.
 
-    Raises:
-        IpcError: if the rest inverse is asked for and no body is bonded, one is too large, or too ill-conditioned.
+    Raises ``IpcError`` if the rest inverse is asked for and no body is bonded, one is too large, or too ill-conditioned.
     """
     name, must = settings.preconditioner, settings.preconditioner != "auto"
     if name == "rest_inverse" or (not must and not settings.deterministic and pays(layout, settings, batch, device)):

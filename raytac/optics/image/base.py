@@ -34,7 +34,7 @@ class ImageHeights:
     displacement: Any
     """Displacement from rest [px]: rest − z."""
     contact: Any
-    """1 where the object touches, else 0 (UInt8); None if nobody asked."""
+    """1 where the object touches, else 0 (UInt8); None if not asked for."""
     envs: int
     resolution: tuple[int, int]
     """(width, height) of the whole image [px]."""

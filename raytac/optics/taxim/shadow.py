@@ -29,7 +29,7 @@ class ShadowArrays:
     """``ordered`` levels, 4 a (direction, depth, step), the last unused; +∞ after a list's end."""
     ends: Any
     """End of a pixel's ray by (direction, depth): that of the longest of the three lists."""
-    ways: Any
+    paths: Any
     """Pixels of a direction's rays by place: (column offset, row offset, step, unused)."""
 
 
@@ -59,15 +59,17 @@ class ShadowCaster:
         beyond = np.arange(length) >= t.lengths[..., None]
         values = np.full((n_dir, n_depth, length, 4), _NOTHING, dtype=np.float32)
         values[..., :3] = np.moveaxis(np.where(beyond, _NOTHING, t.values), 0, -1)
-        ways, counts = self._ways()
+        paths, counts = self._paths()
         lengths = t.lengths.max(axis=0)
         if t.depth_of == "drop":  # a ray may need the list of any depth up to that of its origin
             lengths = np.maximum.accumulate(lengths, axis=1)
         ends = counts[np.arange(n_dir)[:, None], lengths]
-        return ShadowArrays(mi.Int32(ordered(values).ravel()), mi.UInt32(ends.astype(np.uint32).ravel()), mi.Int32(ways.ravel()))
+        return ShadowArrays(mi.Int32(ordered(values).ravel()), mi.UInt32(ends.astype(np.uint32).ravel()), mi.Int32(paths.ravel()))
 
-    def _ways(self) -> tuple[np.ndarray, np.ndarray]:
-        """Ways (n_dir, n_places, 4) int32, and places before step s (n_dir, max_length + 1), from 1.
+    def _paths(self) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels of rays (n_dir, n_places, 4) int32, and how many lie before step s.
+
+        The numbers are (n_dir, max_length + 1), from 1.
 
         Rays of a fan pass the same pixels near their origin; each (step, pixel) is listed once, in the order of the steps.
         """
@@ -108,12 +110,12 @@ class ShadowCaster:
         x0, y0 = mi.Int32(column), mi.Int32(row)
         entry = a * n_depth + d
         end = dr.gather(mi.UInt32, arrays.ends, entry, casts)
-        places = dr.width(arrays.ways) // (4 * n_dir)
+        places = dr.width(arrays.paths) // (4 * n_dir)
         # Integers, since not every device has an atomic minimum of floats.
         least = dr.full(mi.Int32, int(ordered(np.array([_NOTHING]))[0]), 3 * dr.width(i))
 
         def march(k: Any) -> tuple[Any]:
-            place = dr.gather(mi.Vector4i, arrays.ways, a * places + k)
+            place = dr.gather(mi.Vector4i, arrays.paths, a * places + k)
             x, y = x0 + place.x, y0 + place.y
             # Upstream truncates towards zero, so what falls just outside the first row or column is in it.
             x, y = dr.select(x == -1, 0, x), dr.select(y == -1, 0, y)

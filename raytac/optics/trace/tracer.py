@@ -79,8 +79,7 @@ class Tracer(DeviceMode):
 
         ``sampling``: ``spp`` and ``seed`` of a sampled tracer, as of its ``render``.
 
-        Raises:
-            InputError: no output needs light; and as ``render``.
+        Raises ``InputError``: no output needs light; and as ``render``.
         """
         if not self._lit:
             rule = "layers need a tracer with an output of light"

@@ -40,7 +40,7 @@ class Rows:
 
 @wp.func
 def place_of_gap(pads: Pads, pad: wp.int32, x: wp.float64, y: wp.float64, depth: wp.float64, row: wp.int32, rows: Rows):
-    """Place and normal where the gap is least, of a body too sharp to have nodes of its own there."""
+    """Place and normal of the least gap of a body too sharp to have nodes of its own there."""
     fx, fy = pads.first_x[pad, _LAST], pads.first_y[pad, _LAST]
     i = wp.int32(wp.round((x - pads.lines[fx][0]) / (pads.lines[fx + 1][0] - pads.lines[fx][0])))
     j = wp.int32(wp.round((y - pads.lines[fy][0]) / (pads.lines[fy + 1][0] - pads.lines[fy][0])))
@@ -53,7 +53,7 @@ def place_of_gap(pads: Pads, pad: wp.int32, x: wp.float64, y: wp.float64, depth:
 
 @wp.func
 def missing_row(rows: Rows, row: wp.int32, depth: wp.float64, clearance: wp.float64):
-    """A row without a law: of a body that is not over the gel but through it, or (NaN) of a pose that is not finite."""
+    """Row without a law: a body through the gel, or (NaN) a pose that is not finite."""
     rows.valid[row] = 1
     rows.depth[row] = depth
     rows.clearance[row] = clearance

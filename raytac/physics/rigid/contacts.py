@@ -1,4 +1,4 @@
-"""Contacts of bodies with resting pads, as arrays: one row for each environment, pad and body; and their load laws as tables."""
+"""Contacts of bodies with resting pads, a row for each env, pad and body; load-law tables."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LAW_POINTS = 33
 
 @dataclass(frozen=True)
 class PadContacts:
-    """Bodies that touch resting pads or are near them: n rows, sorted by environment, pad and body; pad frame, SI."""
+    """Bodies on or near resting pads: n rows by environment, pad and body; pad frame, SI."""
 
     env: np.ndarray
     """Environment, (n,)."""
@@ -25,18 +25,19 @@ class PadContacts:
     depth: np.ndarray
     """Greatest overlap δ of resting gel and body [m], (n,); negative is a gap."""
     centre: np.ndarray
-    """Centroid of the overlap on the body's underside, or the place of the least gap [m], (n, 3)."""
+    """Centroid of the overlap on the body's underside, or the least gap's place [m], (n, 3)."""
     normal: np.ndarray
     """Unit normal of the resting gel there, (n, 3)."""
     clearance: np.ndarray
-    """Height of the body's lowest point over the pad above the bonded face [m], (n,); <= 0 is through the gel."""
+    """Height of the body's lowest point over the bonded face [m], (n,); <= 0: through the gel."""
     spread: np.ndarray
-    """∫ (x − c)² dA, ∫ (x − c)(y − d) dA and ∫ (y − d)² dA over the overlap, each over its volume ∫ u dA [m], (n, 3): by how much the
-    centroid (c, d) moves when the body tilts about it, per radian; 0 of a gap."""
+    """Second moments of the overlap over its volume ∫ u dA [m], (n, 3); 0 of a gap.
+
+    ∫ (x − c)² dA, ∫ (x − c)(y − d) dA and ∫ (y − d)² dA: by how much the centroid (c, d) moves when the body tilts about it, per radian."""
     deepest: np.ndarray
     """Depth up to which the law is tabulated [m], (n,)."""
     force: np.ndarray
-    """Normal force of the load law, without the hard back, at depths deepest · (k / (M − 1))² [N], (n, M)."""
+    """Normal force [N], (n, M), without the hard back, at depths deepest · (k / (M − 1))²."""
     radius: np.ndarray
     """Contact radius at the same depths [m], (n, M)."""
 
@@ -45,14 +46,14 @@ class PadContacts:
 
 
 class LoadTables:
-    """Load laws of n contacts: the tables with the hard back of the gel (``hard_back``), once continuously differentiable.
+    """Load laws of n contacts with the gel's hard back, once continuously differentiable.
 
     Between entries force and radius are cubic Hermite splines over the root of the depth, in which a table is evenly spaced. Beyond the
     last entry the law goes on straight.
     """
 
     def __init__(self, contacts: PadContacts, thickness: np.ndarray, factor: np.ndarray | float = 1.0) -> None:
-        """``thickness`` (n,) [m] of the gel; ``factor`` (n,) of its modulus, to which the force is proportional."""
+        """``thickness`` (n,) of the gel [m]; ``factor`` (n,) of its modulus and so of the force."""
         self._deepest, self._thickness = contacts.deepest, thickness
         self._limit = contacts.depth + contacts.clearance
         force = contacts.force * np.reshape(factor, (-1, 1))
@@ -64,7 +65,7 @@ class LoadTables:
         self._rows = np.arange(len(force))
 
     def force(self, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Force [N] and incremental stiffness [N/m] at depths (n,) [m]; at depths <= 0 no force, and the stiffness of the first touch."""
+        """Force [N] and stiffness [N/m] at depths (n,) [m]; at <= 0: 0, and that of first touch."""
         last = self._force.shape[1] - 1
         # Below a thousandth of an entry only the stiffness of the first touch counts.
         deep = np.maximum(depth, self._deepest * (0.3 / last) ** 2)

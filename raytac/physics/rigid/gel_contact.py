@@ -1,4 +1,4 @@
-"""Contact of all gels of a world in one step: the kernels from the bodies' motion to the rows, and from forces to the shear."""
+"""Contact of a world's gels in one step: kernels from motion to rows, and force to shear."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ import warp as wp
 
 from raytac.errors import InputError
 from raytac.physics.rigid import world_kernels as world
-from raytac.physics.rigid.env_kernels import choose_active, clear_environments
 from raytac.physics.rigid.load_law import shear_modulus
 from raytac.physics.rigid.motion_kernels import Frames, move_bodies, pair_of_gels
 from raytac.physics.rigid.pierced import BondedFaces
 from raytac.physics.rigid.row_kernels import read_rows, set_rows, sum_wrenches
 from raytac.physics.rigid.search import PadSearch
 from raytac.physics.rigid.shear_state import ShearState
-from raytac.physics.rigid.step_kernels import approach, choose_steps
+from raytac.physics.rigid.step_kernels import approach, choose_active, choose_steps, clear_environments
 from raytac.shapes.part import Part
 from raytac.shapes.primitives import bounds
 from raytac.shapes.underside import object_radius
@@ -26,7 +25,9 @@ from raytac.specs.sensor import GelpadSpec
 from raytac.warp_runtime import start_warp
 
 _AHEAD = 0.05
-"""Share of the gel's thickness by which a step may go deeper on a load law that is tabulated: twice what fast bodies may (``longest``)."""
+"""Share of the gel's thickness that a step may go deeper: twice what fast bodies may.
+
+The load law is tabulated so far (``longest``)."""
 _SHORTEST = 1e-6
 """Steps are not shorter than this, or half of it [s]."""
 
@@ -67,6 +68,7 @@ class GelContact:
         shear: of the gels.
         faces: beyond which no body may be.
         chosen: environments of this step, as ``choose`` named them.
+        numbers: ``Differences`` of the environments, on the device.
     """
 
     def __init__(
@@ -84,14 +86,11 @@ class GelContact:
         """Make the arrays.
 
         Args:
-            gels, bodies: of the world.
             pairs: two gels that may touch, and the search for that.
             numbers: those of ``Differences`` that environments may change, (B, …); on the CPU the arrays themselves are read in every step,
                 on CUDA ``vary`` copies them again.
-            num_envs: B.
             timestep: the scene's step [s].
             case_travel: greatest travel of a body beside a case in a step [m].
-            device: "cpu" or "cuda".
         """
         start_warp()
         self.device = wp.get_device(device)
@@ -100,12 +99,12 @@ class GelContact:
         ahead = _AHEAD * min((gel.thickness for gel in gels), default=0.0)
         self.search = PadSearch(gels, bodies.parts, num_envs=num_envs, ahead=ahead, device=device)
         self._gels, self._touched = _gels(gels, bodies, self.device), _touched(bodies, self.device)
-        self._numbers: Any = world.Differences()
+        self.numbers: Any = world.Differences()
         self._given = dict(numbers)
         for name, values in numbers.items():
             given = wp.array(values, dtype=wp.float64, device=self.device, copy=not self.device.is_cpu)
-            setattr(self._numbers, name, given)
-        self._numbers.carrier = _array(np.concatenate([bodies.index, bodies.carrier]), wp.int32, self.device)
+            setattr(self.numbers, name, given)
+        self.numbers.carrier = _array(np.concatenate([bodies.index, bodies.carrier]), wp.int32, self.device)
         all_pads, bodies_of, slots = (num_envs, pads), (num_envs, pads, count), (num_envs, pads, count + pads)
         self.frames = self._struct(Frames(), (num_envs, pads + count), _FRAMES)
         self.motion = self._struct(world.Motion(), slots, _MOTION)
@@ -134,15 +133,12 @@ class GelContact:
             search.reserve(search.pairs)
 
     def begin(self, *, whole: bool = False) -> None:
-        """Find contacts from ``frames``, choose the length of each environment's step, and set the rows of its contacts.
-
-        ``whole``: of the scene's step, which is not divided.
-        """
+        """Find contacts from ``frames``, choose steps (unless ``whole``), and set the rows."""
         self._move_bodies()
         for search, pad, body in self._pairs:
             poses = [self.motion, self.steps, pad, body, *self._clock, search.poses, search.reach]
             self._launch(pair_of_gels, (), poses)
-        shared = [self._numbers, self._gels, self._touched]
+        shared = [self.numbers, self._gels, self._touched]
         for search, *at in self._searches:
             search.launch()
             results = [search.rows, search.near, search.ends, *search.poses.shape[1:], *at]
@@ -179,7 +175,7 @@ class GelContact:
         self._launch(sum_wrenches, self.wrenches.shape[1:], [self.slots, self.steps, self._touched, self.wrenches])
 
     def choose(self, envs: np.ndarray, done: np.ndarray | int) -> None:
-        """Name the n environments of the next step, whose rows are the first n; ``done`` (n,): ticks of the scene's step behind them."""
+        """Name the n environments of the next step; ``done`` (n,): ticks of the scene's step done."""
         count, self.chosen = len(envs), envs.tolist()
         self._envs[:count], self._envs[count:] = envs, -1
         self._done[:count] = done
@@ -188,7 +184,7 @@ class GelContact:
             self.steps.done.assign(self._done)
 
     def choose_active(self, active: wp.array) -> None:
-        """Make row i of the next step environment i where that is ``active`` (B,), bool, on the device."""
+        """Make row i of the next step environment i where ``active`` (B,), bool, on the device."""
         self._launch(choose_active, (), [active, self.steps])
 
     def clear(self, envs: Sequence[int] | np.ndarray) -> None:
@@ -207,7 +203,7 @@ class GelContact:
         """Take over what has changed in the arrays of ``numbers``; on the CPU that is done already."""
         if not self.device.is_cpu:
             for name, values in self._given.items():
-                getattr(self._numbers, name).assign(values)
+                getattr(self.numbers, name).assign(values)
 
     def _launch(self, kernel: Any, rest: tuple[int, ...], inputs: Sequence[Any]) -> None:
         """``rest``: threads along the axes after that of environments."""
@@ -280,7 +276,7 @@ def _touched(bodies: Bodies, device: Any) -> Any:
 
 
 def _box(part: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Axes, centre and half edges of a box that holds a part, body frame; of a half-space its frame, and inf."""
+    """Axes, centre, half edges of a part's box, body frame; of a half-space its frame and inf."""
     turn, at = part.object_from_part[:3, :3], part.object_from_part[:3, 3]
     if part.kind == "plane":
         return turn, at, np.full(3, np.inf)

@@ -1,4 +1,4 @@
-"""Load law of a contact from its nodes' gaps, in Warp: ``LoadLaw`` at a few depths up to one that is given.
+"""Load law of a contact from its nodes' gaps: ``LoadLaw`` at a few depths, in Warp.
 
 Nodes are sorted into bins by their gap. All that is added up is whole numbers of less than 2^53, so that the sums do not depend on the
 order. Of the nodes of a bin it is not known which has which gap: a bin's mean counts.
@@ -48,9 +48,11 @@ _0 = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
 _STEPS = wp.constant(wp.float64(LAW_POINTS - 1.0))
 DEEPER = wp.constant(wp.float64(((LAW_POINTS - 1.0) / 22.0) ** 2))
-"""Depth up to which a law is tabulated at least, of the present one: some 2, so that this is one of the table's own. Nodes with gaps
-up to half of it count, and at the present depth the contact has no others. At twice that depth the contact on a layer may be wider: there a
-ball's force is 6 % too small if its radius of contact is half the thickness, 17 % if it is the thickness."""
+"""Least depth up to which a law is tabulated, over the present one: some 2.
+
+So the present depth is one of the table's own. Nodes with gaps up to half of it count, and at the present depth the contact has no
+others. At twice that depth the contact on a layer may be wider: there a ball's force is 6 % too small if its radius of contact is half
+the thickness, 17 % if it is the thickness."""
 _FEWEST = wp.constant(wp.float64(6.0))
 """Steps of the table up to the present depth at least, for which it is stretched."""
 _SHALLOWEST = wp.constant(wp.float64(10e-6))
@@ -65,19 +67,21 @@ class Bins:
     sums: wp.array2d(dtype=Sums)
     """(blocks, BINS)."""
     lines: wp.array2d(dtype=wp.vec3d)
-    """Regions that are the contact at some depth, (blocks, BINS + 1): slope and offset of the force, and the depth from which on."""
+    """Slope, offset and first depth of regions that are the contact, (blocks, BINS + 1)."""
 
 
 @wp.func
 def reached_by(depth: wp.float64, reach: wp.float64, ahead: wp.float64) -> wp.float64:
-    """Depth [m] up to which a law is wanted: what a body may reach, but no more than ``ahead`` into the gel or deeper than it is."""
+    """Depth [m] that a body may reach; at most ``ahead`` deeper into the gel than it is."""
     return wp.max(DEEPER * depth, wp.min(depth + reach, wp.max(depth, _0) + ahead))
 
 
 @wp.func
 def deepest_of(depth: wp.float64, reach: wp.float64, ahead: wp.float64, thickness: wp.float64) -> wp.float64:
-    """Depth [m] up to which the law is tabulated: as ``reached_by``, but so that the present depth is one of the table's own, and the gel's
-    thickness at most."""
+    """Depth [m] up to which the law is tabulated: ``reached_by``, at most the thickness.
+
+    The present depth is one of the table's own.
+    """
     deepest = reached_by(depth, reach, ahead)
     if depth > _0 and deepest < thickness:
         k = wp.floor(_STEPS * wp.sqrt(depth / deepest) + wp.float64(1e-9))
@@ -145,7 +149,7 @@ def regions(
     bins: Bins, block: wp.int32, deepest: wp.float64, flat: wp.float64, cell: wp.float64, law: wp.array2d(dtype=wp.float64),
     pad: wp.int32,
 ) -> wp.int32:  # fmt: skip
-    """Write the regions that are the contact at some depth into ``bins.lines``, in the order of their depths; how many.
+    """Write the regions that are the contact into ``bins.lines``, by depth; how many.
 
     Of a region the force is a straight line over the depth; the force of the contact is the envelope of all these lines.
     """
@@ -252,7 +256,7 @@ def tabulate(
     force: wp.array2d(dtype=wp.float64),
     radius: wp.array2d(dtype=wp.float64),
 ):
-    """Force and contact radius of one row at all depths of the table, by one thread; ``flat``: see ``add_node``."""
+    """Force and radius of a row at all depths of the table, one thread; ``flat``: ``add_node``."""
     count = regions(bins, block, deepest, flat, cell, law, pad)
     n, n_before, n_after = wp.int32(0), wp.int32(0), wp.int32(0)
     for point in range(_POINTS):

@@ -1,4 +1,4 @@
-"""Response of a bonded gel layer to round indenters without friction, as a table over the contact's radius."""
+"""Response of a bonded gel layer to round frictionless indenters, by contact radius."""
 
 from __future__ import annotations
 
@@ -20,29 +20,30 @@ _WAVES = 16.0
 
 
 class LayerResponse(NamedTuple):
-    """Contacts of one layer from radius 0 to that of a disc as large as the pad, (ENTRIES,) each."""
+    """Contacts of one layer, radius 0 to that of a disc as large as the pad, (ENTRIES,) each."""
 
     radius: np.ndarray
     """[m]."""
     stiffening: np.ndarray
-    """Stiffness κ of the layer under a flat punch of that radius, relative to a half-space's 2 E* a."""
+    """Stiffness κ of the layer under a flat punch of that radius, over a half-space's 2 E* a."""
     share: np.ndarray
-    """Gap at first touch at the rim of a ball's contact of that radius, over the depth: s = a² / (2Rδ), 1/2 on a half-space."""
+    """Gap at a ball contact's rim at first touch over the depth: a² / (2Rδ), half-space 1/2."""
     moment: np.ndarray
-    """Mean of (r/a)² under the pressure of the flat punch, 2/3 on a half-space and 1/2 where the pressure is even."""
+    """Mean of (r/a)² under the flat punch's pressure: 2/3 on a half-space, 1/2 if even."""
     bend: np.ndarray
-    """Weight of P₂ = 6x² − 6x + 1, x = (r/a)², in that pressure over its mean, 1 + (12 moment − 6)(x − 1/2) + bend P₂: so that the mean of
-    r/a is right too."""
+    """Weight of P₂ = 6x² − 6x + 1, x = (r/a)², in that pressure over its mean.
+
+    The pressure is 1 + (12 moment − 6)(x − 1/2) + bend P₂, so that the mean of r/a is right too."""
 
     def at(self, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """κ, moment and bend at radii [m], linear between the entries' roots; those of the widest contact beyond it."""
+        """κ, moment and bend at radii [m], linear between the entries' roots, constant beyond."""
         root, roots = np.sqrt(radius), np.sqrt(self.radius)
         stiffening, moment, bend = (np.interp(root, roots, entries) for entries in (self.stiffening, self.moment, self.bend))
         return stiffening, moment, bend
 
 
 def layer_response(gelpad: GelpadSpec) -> LayerResponse:
-    """Table of a gel, by the integral equation of Lebedev and Ufliand (J. Appl. Math. Mech. 22, 1958, 442)."""
+    """Table of a gel by Lebedev and Ufliand's integral equation (J. Appl. Math. Mech. 22, 1958)."""
     widest = math.sqrt(_WIDEST * gelpad.size[0] * gelpad.size[1] / math.pi)
     ratio, *entries = _solve(gelpad.poisson_ratio, widest / gelpad.thickness)
     return LayerResponse(gelpad.thickness * ratio, *entries)

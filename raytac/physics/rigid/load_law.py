@@ -1,4 +1,4 @@
-"""Force against depth for any indenter on the bonded gel layer: the law that MuJoCo's contact is made to follow."""
+"""Force against depth for any indenter on the bonded gel layer; MuJoCo's contact obeys it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _TABLE = 512
 _DEPTHS = np.linspace(0.0, 1.0, _TABLE) ** 2
 """Depths of the table over the pad's thickness."""
 SMOOTH = 0.15
-"""Share of a depth, up and down, over which the growth of the force gives the contact's radius."""
+"""Share of a depth, up and down, over which the growth of the force gives the radius."""
 _AT_EDGE = 1e-9
 """Nodes within this of an edge of the pad are on it [m]."""
 
@@ -29,8 +29,9 @@ def reduced_modulus(gelpad: GelpadSpec) -> float:
 
 
 HARD_FROM, HARD_RISE = 0.2, 20.0
-"""Share of the gel's thickness below which its back is felt, and how fast: a choice, no measurement. With 20 a press at a tenth of the
-thickness takes 21 times the force of the layer."""
+"""Share of the gel's thickness below which its back is felt, and how fast.
+
+A choice, no measurement. With 20 a press at a tenth of the thickness takes 21 times the force of the layer."""
 
 
 def hard_back(depth: np.ndarray, limit: np.ndarray | float, thickness: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
@@ -59,22 +60,22 @@ def shear_stiffness(radius: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
 
 
 TWIST_STIFFENING = 0.0957, 0.325, 0.28, 0.4
-"""Constants of ``twist_stiffening``: the first by expansion, the second makes it 3π/32 x for large x."""
+"""Constants of ``twist_stiffening``: by expansion, then to have 3π/32 x at large x."""
 
 
 def twist_stiffening(ratio: np.ndarray) -> np.ndarray:
-    """Twist stiffness of a bonded layer over that of a half-space, by the contact's radius over the layer's thickness.
+    """Twist stiffness of a bonded layer over a half-space's, by contact radius over thickness.
 
-    A torsion dies out within a radius, so that a base hardly shows before it is that near: 1 + (2/3π) ∫ κ² (1 − tanh κ) dκ x³ for small x,
-    and (3π/32) x for large ones, where the torque per angle is GJ/h. Between both a fraction, fitted to the integral equation of a disc
-    that sticks to a layer (as of E. Reissner and H. F. Sagoci, J. Appl. Phys. 15, 1944, with the compliance tanh(kh)/(Gk)).
+    A torsion dies out within a radius, so that a base hardly shows before it is that near: 1 + (2/3π) ∫ κ² (1 − tanh κ) dκ x³ for small
+    x, and (3π/32) x for large ones, where the torque per angle is GJ/h. Between both a fraction, fitted to the integral equation of a
+    disc that sticks to a layer (as of E. Reissner and H. F. Sagoci, J. Appl. Phys. 15, 1944, with the compliance tanh(kh)/(Gk)).
     """
     first, second, third, fourth = TWIST_STIFFENING
     return 1.0 + first * ratio**3 / (1.0 + ratio**2 * (second + third / (1.0 + fourth * ratio)))
 
 
 def twist_stiffness(radius: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
-    """Torque per angle [N m/rad] of a disc that sticks: 16Ga³/3 of a half-space (Reissner and Sagoci) times ``twist_stiffening``."""
+    """Torque per angle [N m/rad] of a disc that sticks: 16Ga³/3 times ``twist_stiffening``."""
     return 16.0 / 3.0 * shear_modulus(gelpad) * radius**3 * twist_stiffening(radius / gelpad.thickness)
 
 
@@ -83,7 +84,9 @@ def shear_modulus(gelpad: GelpadSpec) -> float:
 
 
 class LoadLaw:
-    """Normal force, contact radius and tangential stiffness against depth, from the gap between object and resting gel.
+    """Normal force, contact radius and tangential stiffness against depth.
+
+    They follow from the gap between object and resting gel.
 
     A contact that covers a region Ω of the gel has, at a depth δ, the force k(Ω) (δ − ⟨gap⟩): k the stiffness of the flat punch Ω, ⟨gap⟩
     the mean of the gap at first touch under that punch's pressure (Betti's theorem). The true Ω is that of the greatest force (Barber,
@@ -93,8 +96,8 @@ class LoadLaw:
     region's centroid, ρ² 1/2 in the mean, and x the area of smaller gaps over the region's. On a round contact x is ρ². Under a face that
     tilts it is not, and ρ keeps its middle in place.
 
-    So the law is that of the layer for flat punches, level or tilted, for paraboloids and for cones. Separate contacts count as one of the
-    same area. Near the bonded face the law grows without bound (``hard_back``). F is strictly increasing in δ and 0 at δ <= 0.
+    So the law is that of the layer for flat punches, level or tilted, for paraboloids and for cones. Separate contacts count as one of
+    the same area. Near the bonded face the law grows without bound (``hard_back``). F is strictly increasing in δ and 0 at δ <= 0.
     """
 
     def __init__(self, gap: np.ndarray, x: np.ndarray, y: np.ndarray, gelpad: GelpadSpec, deepest: float = np.inf) -> None:
@@ -115,11 +118,14 @@ class LoadLaw:
         """Normal force of the table, without the hard back [N]."""
         step = np.maximum(SMOOTH * self.depth, 1e-12)
         self.radius = _punch_radius((force(self.depth + step) - force(self.depth - step)) / (2.0 * step), gelpad)
-        """Contact radius of the table [m]: of the flat punch whose force grows as fast, over ``SMOOTH`` of the depth."""
+        """Radius [m] of the flat punch whose force grows as fast, over ``SMOOTH`` of the depth."""
 
     @property
     def greatest(self) -> float:
-        """Greatest force of a press [N]: with a twentieth of the thickness left, where the hard back takes 181 times the layer's force."""
+        """Greatest force of a press [N]: with a twentieth of the thickness left.
+
+        There the hard back takes 181 times the layer's force.
+        """
         return self.force(self.deepest - 0.05 * self.thickness)
 
     def force(self, depth: float) -> float:
@@ -128,7 +134,7 @@ class LoadLaw:
         return float(np.interp(depth, self.depth, self.table) * factor)
 
     def depth_at(self, force: float) -> float:
-        """Depth [m] at which the law reaches ``force`` [N]; raises ``InputError`` if that is more than ``greatest``."""
+        """Depth [m] at which the law reaches ``force`` [N]; InputError beyond ``greatest``."""
         if force > self.greatest:
             rule = f"would press deeper than the pad is there: at most {self.greatest:.4g} N, {self.deepest * 1e3:.4g} mm deep"
             raise InputError("force", value=force, rule=rule)
@@ -146,7 +152,7 @@ class LoadLaw:
         return max(self.deepest - HARD_FROM * self.thickness, 0.0)
 
     def stiffest(self, force: float) -> float:
-        """Greatest incremental stiffness [N/m] of the layer at any depth, and of the hard back up to ``force`` [N]."""
+        """Greatest incremental stiffness [N/m], of the hard back only up to ``force`` [N]."""
         stiffest = float((np.diff(self.table) / np.diff(self.depth)).max())
         depth = self.depth_at(min(force, self.greatest))
         if depth <= self.hard_from:
@@ -179,7 +185,7 @@ class LoadLaw:
 def region_lines(
     gap: np.ndarray, x: np.ndarray, y: np.ndarray, gelpad: GelpadSpec, highest: float = np.inf, levels: int = 1024
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Stiffness k [N/m] and k ⟨gap⟩ [N] of regions, (n,) each: F = k δ − k ⟨gap⟩ of each, and the contact's is the greatest.
+    """Stiffness k [N/m] and k ⟨gap⟩ [N] of regions, (n,) each; F is max k δ − k ⟨gap⟩.
 
     They are half a node, which stands for a tip between nodes, and all where the gap is below one of ``levels`` up to ``highest`` [m],
     evenly spaced in their roots. Other arguments are those of ``LoadLaw``.
@@ -230,8 +236,7 @@ class FirstTouch(NamedTuple):
     gap: np.ndarray
     """Gap of ``gap_at_touch`` at that height, (Ny, Nx) [m]."""
     deepest: float
-    """Travel from there [m] that takes the object's lowest point over the pad to the bonded face: the thickness at the centre of the pad,
-    less on the flanks of the dome."""
+    """Travel [m] from there to the bonded face: the thickness, less on the dome's flanks."""
 
 
 def first_touch(parts: Sequence[Part], pose: np.ndarray, gelpad: GelpadSpec, grid: PadGrid) -> FirstTouch:
@@ -270,12 +275,12 @@ def first_touch_z(parts: Sequence[Part], pose: np.ndarray, gelpad: GelpadSpec, g
 
 
 def gap_at_touch(parts: Sequence[Part], pose: np.ndarray, grid: PadGrid) -> np.ndarray:
-    """Distance [m] along z from the resting gel to the object at each node, (Ny, Nx), for a pose at first touch; >= 0."""
+    """Gap [m] along z between resting gel and object, (Ny, Nx), at a first-touch pose; >= 0."""
     return np.maximum(object_height(parts, pose[None], grid.x, grid.y)[0] - grid.rest, 0.0)
 
 
 def _least(of: Callable[[np.ndarray, np.ndarray], np.ndarray], values: np.ndarray, grid: PadGrid) -> float:
-    """Least value of a function over the pad, which has ``values`` on the grid's nodes: that node is zoomed in on."""
+    """Least value of a function over the pad, zooming in on the lowest of its node ``values``."""
     x, y, least = grid.x, grid.y, np.inf
     for zoom in range(_ZOOMS + 1):
         if zoom:

@@ -1,4 +1,4 @@
-"""Poses and velocities of bodies, and of other gels, in the frames of pads, and how far that motion may reach; in Warp.
+"""Motion of bodies and other gels in the frames of pads, and how far it may reach.
 
 All points of a body stay in a ball about its origin, which for a half-space is taken as 1 m. From the greatest speed of such a point
 follow the reach of the search, and the step in which a body beside a case comes no farther than MuJoCo's own margin there.
@@ -35,7 +35,7 @@ class Frames:
     spin: wp.array2d(dtype=wp.vec3d)
     """[rad/s]."""
     push: wp.array2d(dtype=wp.vec3d)
-    """Acceleration of the origin [m/s²] that everything but contacts and other constraints would give."""
+    """Acceleration of the origin [m/s²] without contacts and other constraints."""
     swing: wp.array2d(dtype=wp.vec3d)
     """Angular acceleration of the same kind [rad/s²]."""
 
@@ -58,9 +58,10 @@ def frame_of(frames: Frames, touched: Touched, body: wp.int32) -> wp.int32:
 def closing_push(
     frames: Frames, touched: Touched, row: wp.int32, pad: wp.int32, body: wp.int32, point: wp.vec3d, normal: wp.vec3d
 ) -> wp.float64:
-    """Acceleration [m/s²] by which a contact may close faster, at a point and along the gel's normal, world frame.
+    """Acceleration [m/s²] by which a contact may close faster, at a point along the normal.
 
-    Either side may be held by other contacts, so that one that goes away does not make up for the other.
+    ``point`` and ``normal`` of the gel are in the world frame. Either side may rest on other contacts, so that one that goes away does
+    not make up for the other.
     """
     of_pad = wp.dot(push_at(frames, row, pad, point), normal)
     of_body = wp.dot(push_at(frames, row, frame_of(frames, touched, body), point), normal)
@@ -124,7 +125,7 @@ def may_pierce(gels: Gels, touched: Touched, pad: wp.int32, body: wp.int32, pose
 
 @wp.func
 def went_far(gels: Gels, touched: Touched, pad: wp.int32, body: wp.int32, before: wp.mat44d, pose: wp.mat44d) -> wp.bool:
-    """True where a point of a body went farther than the gel's thickness; False of a pose before that is not known (NaN)."""
+    """True where a point of a body went farther than the gel's thickness; False from NaN."""
     angle = turned_by(turn_of(before), turn_of(pose))
     travel = wp.length(place_of(pose) - place_of(before)) + angle * wp.min(touched.radius[body], wp.float64(1e9))
     if touched.radius[body] == _INF:  # a half-space moves along its normal
@@ -153,7 +154,7 @@ def move_bodies(
     poses: wp.array3d(dtype=wp.mat44d),
     reach: wp.array2d(dtype=wp.float64),
 ):
-    """Motion of everything relative to one pad in one environment; poses and reach of the search for bodies; empty slots.
+    """Motion of everything relative to one pad, poses and reach of the search, empty slots.
 
     ``before`` (B, pads, bodies): poses of the last step, NaN where unknown; it becomes the present ones. ``timestep``: the scene's [s],
     of ``scene_ticks`` ticks. ``case_travel``: greatest travel of a body beside a case in a step [m], less than the gap from which their
@@ -238,7 +239,7 @@ def pair_of_gels(
     poses: wp.array3d(dtype=wp.mat44d),
     reach: wp.array2d(dtype=wp.float64),
 ):
-    """Poses and reach of the search for another gel, which is ``body``; a reach of −inf where it is not near."""
+    """Poses and reach of the search for another gel, ``body``; reach −inf if not near."""
     row = wp.tid()
     if steps.envs[row] < 0 or motion.near_gel[row, pad, body - (motion.pose.shape[2] - motion.near_gel.shape[2])] == 0:
         poses[row, 0, 0] = wp.mat44d()

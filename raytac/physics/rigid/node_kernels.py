@@ -1,4 +1,4 @@
-"""Heights of one body on the nodes of a pad's grids, in Warp: single nodes, between them, and bounds around them; sums over a block."""
+"""Heights of one body on a pad's nodes and between them, their bounds, sums over a block."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -45,8 +45,9 @@ def least_of(value: Any):
 def pierced_at(
     shapes: Shapes, pads: Pads, placed: Placed, block: wp.int32, lane: wp.int32, lanes: wp.int32, pad: wp.int32, level: wp.int32
 ) -> wp.float64:
-    """Lowest z [m] of the body on lines on which it lies in the layer of one thickness behind the bonded face; inf if on none.
+    """Lowest z [m] of the body on lines inside the layer behind the bonded face; else inf.
 
+    That layer has one thickness.
     Lines on which it lies wholly behind that layer do not count, nor the pad's outermost lines: MuJoCo lets bodies some hundredths of a
     millimetre into walls, and a case may be as wide as its gel.
     """
@@ -72,7 +73,7 @@ def pierced_at(
 def height_at(
     shapes: Shapes, pads: Pads, placed: Placed, block: wp.int32, pad: wp.int32, level: wp.int32, i: wp.int32, j: wp.int32
 ) -> wp.vec2d:
-    """z [m] of the body over node i, j, and its gap to the gel; inf where there is none or it is below the bonded face."""
+    """z [m] of the body over node i, j, and its gap; inf without one or below the bonded face."""
     if i < 0 or j < 0 or i >= pads.nx[pad, level] or j >= pads.ny[pad, level]:
         return wp.vec2d(_INF, _INF)
     x, y = pads.lines[pads.first_x[pad, level] + i], pads.lines[pads.first_y[pad, level] + j]
@@ -84,7 +85,7 @@ def height_at(
 
 @wp.func
 def vertex_of(before: wp.float64, middle: wp.float64, after: wp.float64, pitch: wp.float64) -> wp.vec2d:
-    """Drop below the middle of a parabola through three values at −1, 0, 1, and where; (0, 0) if it is none.
+    """Drop of a parabola through values at −1, 0, 1 below the middle, and where; else (0, 0).
 
     Where a neighbour is higher by half the pitch, it lies beyond an edge, through which no parabola goes. Where one is lower, the least
     value is beyond the nodes that were looked at.
@@ -101,7 +102,9 @@ def between_nodes(
     shapes: Shapes, pads: Pads, placed: Placed, block: wp.int32, pad: wp.int32, level: wp.int32, i: wp.int32, j: wp.int32,
     middle: wp.float64, of: wp.int32,
 ) -> wp.vec3d:  # fmt: skip
-    """Drop [m] below ``middle``, the z (``of`` 0) or gap (1) at node i, j, and the place of the least along x and y [nodes].
+    """Drop [m] below ``middle`` at node i, j, and the place of the least along x, y [nodes].
+
+    ``middle`` is the z (``of`` 0) or the gap (1) there.
 
     By parabolas through the neighbours along both axes.
     """
@@ -122,8 +125,11 @@ def look_at_nodes(
     gap: wp.array(dtype=wp.float64), lines: wp.array(dtype=wp.vec3d), first_x: wp.int32, first_y: wp.int32, lane: wp.int32, nx: wp.int32,
     ny: wp.int32, bond: wp.float64, below: wp.float64,
 ):  # fmt: skip
-    """Turn a thread's heights of a body on ny rows of nx nodes into gaps to the gel, inf of those beneath the bonded face ``bond``; return
-    how many are lower than ``below``, the least and its node, and the lowest height and its node [m]."""
+    """Turn a thread's heights on ny rows of nx nodes into gaps to the gel.
+
+    Gaps beneath the bonded face ``bond`` are inf. Returns how many are lower than ``below``, the least and its node, and the lowest
+    height and its node [m].
+    """
     count, near_node, low_node = wp.int32(0), wp.int32(_MANY), wp.int32(_MANY)
     least, low = infinity(), infinity()
     j = lane // across()
@@ -152,8 +158,10 @@ def look_at_nodes(
 
 @wp.func
 def rises_at(gap: wp.array(dtype=wp.float64), k: wp.int32, step: wp.int32, at: wp.int32, count: wp.int32) -> wp.vec2d:
-    """Rises [m] from node k of a window, the ``at``-th on its line of ``count`` nodes that are ``step`` apart, to those before and after;
-    inf where there is none."""
+    """Rises [m] from node k to those before and after on its line; inf where there is none.
+
+    It is the ``at``-th of ``count`` nodes that are ``step`` apart in the window.
+    """
     before, after = infinity(), infinity()
     if at > 0:
         before = gap[k - step] - gap[k]
@@ -166,9 +174,10 @@ def rises_at(gap: wp.array(dtype=wp.float64), k: wp.int32, step: wp.int32, at: w
 def fall_along(
     gap: wp.array(dtype=wp.float64), k: wp.int32, step: wp.int32, at: wp.int32, count: wp.int32, rises: wp.vec2d, steep: wp.float64
 ) -> wp.vec2d:  # fmt: skip
-    """Fall [m] of a convex gap within a spacing of node k, at most, by ``rises_at`` it; and for how many spacings around the node this
-    must hold: 0.5, 1 beside the outline of body or window, 2 at the body's outline, which may end in a tip that has no node on the next
-    line.
+    """Greatest fall [m] of a convex gap within a spacing of node k, by ``rises_at`` it.
+
+    Also for how many spacings around the node this must hold: 0.5, 1 beside the outline of body or window, 2 at the body's outline, which
+    may end in a tip that has no node on the next line.
 
     A convex function falls on one side of a node by no more than it rises on the other. A neighbour that is higher by more than ``steep``
     bounds nothing. It counts as one beyond the outline: the node on the other side bounds what is between.
@@ -198,8 +207,10 @@ def extent(room: wp.float64, rise: wp.float64, around: wp.float64) -> wp.float64
 
 @wp.func
 def nodes_near(gap: wp.array(dtype=wp.float64), lane: wp.int32, nx: wp.int32, ny: wp.int32, below: wp.float64) -> wp.vec4d:
-    """As ``nodes_below`` of any gap, without a bound: where nodes are lower than ``below`` [m] and two nodes more, for an outline may end
-    in a tip that has no node on the next line."""
+    """``nodes_below`` of any gap, without a bound: nodes below ``below`` [m] and two more.
+
+    An outline may end in a tip that has no node on the next line.
+    """
     x0, x1, y0, y1 = wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY), wp.int32(_MANY)
     j = lane // across()
     while j < ny:
@@ -219,10 +230,10 @@ def nodes_near(gap: wp.array(dtype=wp.float64), lane: wp.int32, nx: wp.int32, ny
 def nodes_below(
     gap: wp.array(dtype=wp.float64), lane: wp.int32, nx: wp.int32, ny: wp.int32, below: wp.float64, steep: wp.float64
 ):
-    """Lower bound of a convex gap [m], and the part of a window of ny rows of nx nodes in which it may be at ``below`` or lower [m].
+    """Lower bound of a convex gap [m], and where in a window it may be ``below`` or lower [m].
 
-    The bound is for a window in which no node is lower than ``below``. The part: x from, to, y from, to in spacings from the first node;
-    the first is inf if it is nowhere.
+    The window has ny rows of nx nodes. The bound is for one in which no node is lower than ``below``. The part: x from, to, y from, to in
+    spacings from the first node; the first is inf if it is nowhere.
     """
     least, x0, x1, y0, y1 = wp.float64(below), infinity(), -infinity(), infinity(), -infinity()
     j = lane // across()
@@ -263,7 +274,7 @@ def box_around(
 
 @wp.func
 def is_convex(shapes: Shapes, placed: Placed, block: wp.int32) -> wp.bool:
-    """True if one part alone is near and is convex: its gap to the resting gel, which is a cap, is convex over the line of sight."""
+    """True if one convex part alone is near: its gap to the resting gel, a cap, is convex."""
     parts, convex = wp.int32(0), wp.int32(1)
     for k in range(placed.count[block]):
         if placed.part[block, k] >= 0:

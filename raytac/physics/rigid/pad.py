@@ -1,4 +1,4 @@
-"""The rigid pad: MuJoCo moves object or case, the contact's compliance ties depth to force, the gel's shape follows from geometry."""
+"""The rigid pad: depth and force by the load law in MuJoCo, the gel's shape by geometry."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class RigidPad(PressPad):
     """
 
     def __init__(self, sensor: SensorSpec, scene: PressScene, **settings: Any) -> None:
-        """Build the grid, the object and the elastic surround; ``settings`` and errors as of ``PressPad``."""
+        """Build the grid, the object and the surround; ``settings`` and errors as of ``PressPad``."""
         if scene.object.dynamics == "soft":
             rule = "is for the soft pad, physics='ipc': the rigid pad's object does not give way"
             choices = tuple(name for name in DYNAMICS if name != "soft")
@@ -62,9 +62,9 @@ class RigidPad(PressPad):
         self._surround = ElasticSurround(self.grid)
         self._touches: dict[bytes, tuple[float, LoadLaw]] = {}
         self._environments: list[_Environment] = []
-        """State of every environment at the last reading; empty before the first, and without an object."""
+        """State of every environment at the last reading; empty before, and without an object."""
         self._begun: tuple[int, int, list[_Environment]] = -1, 1, []
-        """Index and readings of the stage that was begun last, and the environments as they were before it."""
+        """Index and readings of the last stage begun, and the environments before it."""
 
     def reset(self) -> None:
         self._environments = [self._start_of(b) for b in range(self.num_envs)] if self.parts else []
@@ -92,7 +92,7 @@ class RigidPad(PressPad):
         return reading
 
     def surface_from_pose(self, pad_from_object: np.ndarray) -> GelSurface:
-        """Gel surface with the object at given poses (B, 4, 4), for a loop in which another simulation moves it.
+        """Gel surface with the object at poses (B, 4, 4), for a loop that moves it.
 
         A pose that is not finite, or that would press the gel below its bonded face, gives a surface of NaN. Raises ``InputError`` for
         another shape.
@@ -119,7 +119,7 @@ class RigidPad(PressPad):
         return PressRig(self.scene.object.mass, stiffest, self.scene.moves)
 
     def _touch(self, b: int, x: float, y: float, twist: float) -> tuple[float, LoadLaw]:
-        """First-touch height of the object's origin and load law at a place and angle; kept, since environments share them."""
+        """First-touch height of the object's origin and load law at a place and angle; cached."""
         pose = np.eye(4)
         pose[:3, :3] = about_z(twist) @ self.targets.rotations[b]
         pose[:2, 3] = x, y
@@ -227,7 +227,7 @@ class RigidPad(PressPad):
 
 
 def _wrench(surface: GelSurface, force: np.ndarray, twist_torque: np.ndarray) -> np.ndarray:
-    """Wrench (B, 6) of a force (B, 3) at the contact's centre, at the height of the gel there, and of a torque (B,) about z."""
+    """Wrench (B, 6) of a force (B, 3) at the contact's centre on the gel and a torque about z."""
     grid, at = surface.grid, np.zeros((len(force), 3))
     for b, (x, y) in enumerate(np.nan_to_num(surface.contact_centre)):
         node = np.abs(grid.y - y).argmin(), np.abs(grid.x - x).argmin()

@@ -36,8 +36,9 @@ _INF = wp.constant(wp.float64(float("inf")))
 
 @wp.func
 def lines_below(shapes: Shapes, pads: Pads, pad: wp.int32, body: wp.int32, pose: wp.mat44d) -> wp.vec4i:
-    """Lines of the pad on which parts of a body may be lower than the bonded face: x from, to, y from, to. None if it all lies behind.
+    """Lines of the pad on which parts of a body may be lower than the bonded face.
 
+    x from, to, y from, to; none if the body lies behind it as a whole.
     Without the outermost lines: MuJoCo lets bodies some hundredths of a millimetre into walls, and a case may be as wide as its gel.
     """
     low_x, high_x, low_y, high_y = infinity(), -infinity(), infinity(), -infinity()
@@ -71,8 +72,9 @@ def lines_below(shapes: Shapes, pads: Pads, pad: wp.int32, body: wp.int32, pose:
 
 @wp.func
 def end_on_line(shapes: Shapes, body: wp.int32, pose: wp.mat44d, x: wp.float64, y: wp.float64, side: wp.float64) -> wp.float64:
-    """Lowest z [m] of a body on the vertical line at x, y (``side`` 1), or minus the highest (−1); inf where the line misses it.
+    """Lowest z [m] of a body on the line at x, y (``side`` 1), or minus the highest (−1).
 
+    It is inf where the line misses the body.
     The top of a body is the underside of the body turned over about x.
     """
     result = infinity()
@@ -88,7 +90,7 @@ def end_on_line(shapes: Shapes, body: wp.int32, pose: wp.mat44d, x: wp.float64, 
 def is_beyond(
     shapes: Shapes, pads: Pads, pad: wp.int32, body: wp.int32, pose: wp.mat44d, lane: wp.int32, lanes: wp.int32
 ) -> wp.bool:
-    """True where a body at a pose lies beyond the bonded face on one of the lines of this thread; False of a pose that is not finite."""
+    """True where a finite pose is beyond the bonded face on a line of this thread."""
     if not is_finite(pose):
         return False
     bond = -pads.thickness[pad]
@@ -110,7 +112,7 @@ def is_beyond(
 
 @wp.func
 def pieces_of(shapes: Shapes, pads: Pads, pad: wp.int32, body: wp.int32, before: wp.mat44d, pose: wp.mat44d, angle: wp.float64):
-    """Pieces of a motion that turns by ``angle`` [rad], so short that no point moves by more than a thickness."""
+    """Pieces of a motion that turns by ``angle`` [rad]; in each no point exceeds a thickness."""
     travel = wp.length(place_of(pose) - place_of(before)) + angle * shapes.ball[body]
     if shapes.ball[body] == _INF:  # a half-space moves along its normal
         part = shapes.first_part[body]
@@ -125,9 +127,9 @@ def pieces_of(shapes: Shapes, pads: Pads, pad: wp.int32, body: wp.int32, before:
 def went_beyond(
     shapes: Shapes, pads: Pads, pad: wp.int32, body: wp.int32, before: wp.mat44d, pose: wp.mat44d, lane: wp.int32, lanes: wp.int32
 ) -> wp.bool:
-    """``is_beyond`` at a pose, or on the straight path there from ``before``, whose place and rotation vector change linearly.
+    """``is_beyond`` at a pose or on the straight path there from ``before``.
 
-    A pose before that is not known is NaN.
+    Place and rotation vector change linearly on it. A pose before that is not known is NaN.
     """
     if is_beyond(shapes, pads, pad, body, pose, lane, lanes):
         return True
@@ -153,7 +155,7 @@ def went_beyond(
 
 @wp.kernel
 def lose_pierced(shapes: Shapes, pads: Pads, motion: Motion, lanes: wp.int32, steps: Steps):
-    """Lose environments in which a body that is suspected is beyond a bonded face, or was on its path since the last step."""
+    """Lose environments in which a suspected body is or went beyond a bonded face."""
     row, pad, body, lane = wp.tid()
     if steps.envs[row] >= 0 and motion.suspect[row, pad, body] != 0:
         pose, before = motion.pose[row, pad, body], motion.before[row, pad, body]
@@ -167,7 +169,7 @@ def find_pierced(
     # outputs
     pierced: wp.array3d(dtype=wp.int32),
 ):  # fmt: skip
-    """1 (n, pads, bodies) where a body is beyond a bonded face, or was on its path from ``before``; 0 before."""
+    """Set 1 (n, pads, bodies) where a body is or, since ``before``, went beyond a bonded face."""
     row, pad, body, lane = wp.tid()
     if went_beyond(shapes, pads, pad, body, before[row, pad, body], poses[row, pad, body], lane, lanes):
         pierced[row, pad, body] = 1

@@ -21,7 +21,7 @@ _LANES = 128
 
 
 class BondedFaces:
-    """Bonded faces of pads, and the cases behind them (see ``pierce_kernels``), on the CPU or on CUDA."""
+    """Bonded faces of pads, and the cases behind them (``pierce_kernels``), on CPU or CUDA."""
 
     def __init__(self, pads: PadArrays, bodies: ShapeArrays, device: Any) -> None:
         """``pads`` and ``bodies``: on the device."""
@@ -36,9 +36,11 @@ class BondedFaces:
         return cls(PadArrays(gelpads, PITCHES, LAST, device), ShapeArrays(bodies, device), device)
 
     def pierced(self, pad_from_body: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
-        """True (n, pads, bodies) where bodies at poses (n, pads, bodies, 4, 4) are beyond a pad's bonded face, or were on their path.
+        """True (n, pads, bodies) where bodies are beyond a pad's bonded face, or went there.
 
-        ``before``: poses that they come from, NaN where unknown; None is unknown everywhere. A pose that is not finite is not beyond.
+        Args:
+            pad_from_body: poses (n, pads, bodies, 4, 4); one that is not finite is not beyond.
+            before: poses that they come from, NaN where unknown; None is unknown everywhere.
         """
         if before is None:
             before = np.full(pad_from_body.shape, np.nan)
@@ -49,6 +51,6 @@ class BondedFaces:
         return result.numpy() != 0
 
     def lose(self, motion: Any, steps: Any) -> None:
-        """Lose environments of a step in which a body is beyond a face, or was on its path; it launches one kernel."""
+        """Lose environments of a step in which a body is or went beyond a face; one kernel."""
         inputs = [self._bodies.struct, self._pads.struct, motion, self._lanes, steps]
         wp.launch(lose_pierced, dim=(*motion.suspect.shape, self._lanes), inputs=inputs, device=self._device)

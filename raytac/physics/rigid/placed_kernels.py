@@ -43,7 +43,7 @@ class Pads:
     cell: wp.array2d(dtype=wp.float64)
     """Area of one node [m²]."""
     lines: wp.array(dtype=wp.vec3d)
-    """Place, height of the resting gel and its slope; the gel is the sum of a function of x and one of y (``GelpadSpec.sag``)."""
+    """Place, height and slope of the resting gel, a function of x plus one of y (``sag``)."""
     law: wp.array2d(dtype=wp.float64)
     """Constants of the load law (pads, n), see ``law_kernels``."""
 
@@ -94,7 +94,7 @@ def rotation_of(pose: wp.mat44d) -> wp.mat33d:
 def bottom_near(
     shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d, pads: Pads, pad: wp.int32, reach: wp.float64
 ) -> wp.float64:
-    """Lower bound of z [m] of a part over the pad; inf if it stays out of reach of the gel and the layer behind it."""
+    """Lower bound of z [m] of a part over the pad; inf if out of reach of gel and layer behind."""
     half_x, half_y, highest = pads.half[pad][0], pads.half[pad][1], pads.highest[pad] + reach
     bottom = infinity()
     if shapes.kind[part] == _PLANE:
@@ -121,7 +121,7 @@ def lowest_of(shapes: Shapes, part: wp.int32, pose: wp.mat44d, pads: Pads, pad: 
 
 @wp.func
 def width_along_z(shapes: Shapes, part: wp.int32, rotation: wp.mat33d) -> wp.float64:
-    """Least width [m] of the outline of the part's own box as seen along z, square to one of its edges."""
+    """Least width [m] of the outline of a part's box seen along z, square to an edge."""
     result, half = wp.float64(shapes.width[part]), shapes.half[part]
     for k in range(3):
         x, y = half[k] * rotation[0, k], half[k] * rotation[1, k]
@@ -199,7 +199,7 @@ def nodes_within(first: wp.int32, count: wp.int32, low: wp.float64, high: wp.flo
 
 @wp.func
 def window(pads: Pads, placed: Placed, block: wp.int32, pad: wp.int32, level: wp.int32, below: wp.float64) -> wp.vec4i:
-    """Nodes of a grid over which a placed part may be lower than ``below`` [m]: x from, to, y from, to."""
+    """Nodes where a placed part may be lower than ``below`` [m]: x from, to, y from, to."""
     low_x, high_x, low_y, high_y = infinity(), -infinity(), infinity(), -infinity()
     for k in range(placed.count[block]):
         if placed.part[block, k] >= 0 and placed.bottom[block, k] <= below:
@@ -219,8 +219,9 @@ def window(pads: Pads, placed: Placed, block: wp.int32, pad: wp.int32, level: wp
 
 @wp.func
 def under(shapes: Shapes, placed: Placed, block: wp.int32, x: wp.float64, y: wp.float64, top: wp.bool) -> wp.float64:
-    """Lowest z [m] of the placed parts on the line at x, y, inf if it misses all; or (``top``) the highest, inf of a half-space.
+    """Lowest z [m] of the placed parts on the line at x, y; inf if it misses all.
 
+    With ``top`` the highest, inf of a half-space.
     The top of a body is the underside of the body turned over about x.
     """
     result = infinity()
@@ -244,8 +245,9 @@ def under(shapes: Shapes, placed: Placed, block: wp.int32, x: wp.float64, y: wp.
 
 @wp.func
 def entries_of(size: wp.vec3d, rotation: wp.mat33d, at: wp.vec3d):
-    """Heights at which vertical lines enter the three slabs of a box, as rows of factors of x, y and 1, and lengths inside [m].
+    """Heights at which vertical lines enter the slabs of a box, and lengths inside [m].
 
+    The three heights are rows of factors of x, y and 1.
     Of a slab that is parallel to the lines both ends are far away, on one side of the line or on both.
     """
     entry, length = wp.mat33d(), wp.vec3d()
@@ -280,7 +282,7 @@ def under_nodes(
     # outputs
     height: wp.array(dtype=wp.float64),
 ):  # fmt: skip
-    """``under`` on ny rows of nx nodes, each thread its own; the first ones are at ``first_x``, ``first_y`` of ``lines``."""
+    """``under`` on ny rows of nx nodes from ``first_x``, ``first_y`` on, each thread its own."""
     others = wp.bool(False)
     for m in range(placed.count[block]):
         part = placed.part[block, m]

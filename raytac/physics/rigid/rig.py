@@ -1,4 +1,4 @@
-"""The press rig in MuJoCo: object and case, one of them driven, with a compliant contact between them."""
+"""The press rig in MuJoCo: object and case, one of them driven, and a compliant contact."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 IMPEDANCE = 0.5
-"""Constant impedance d of the contact (solimp = d, d, …): regularisation R = A (1 − d) / d equals the contact's own A."""
+"""Constant impedance d (solimp = d, d, …): R = A (1 − d) / d equals the contact's own A."""
 _TIME_STEP = 1e-3
 _STIFFEST = 1e4
 """Greatest −solref[0] [1/s²] at this time step: ω Δt = 0.1."""
@@ -17,13 +17,13 @@ _SLAB = 1.0
 """Half edge of the slab that stands for the pad [m]."""
 _SETTLED = 1e-4
 _RUNAWAY = 1.0
-"""Distance from the pad [m] at which the driven side counts as lost; before MuJoCo sees a huge number and writes a log file."""
+"""Distance [m] at which the driven side counts as lost, before MuJoCo logs huge numbers."""
 _PATIENCE = 20_000
 """Steps that a force may take to settle after its ramp."""
 
 
 def contact_solref(stiffness: float, mass: float, impedance: float = IMPEDANCE) -> tuple[float, float]:
-    """MuJoCo's ``solref`` in direct form, (−s, −b), of a contact with normal stiffness K [N/m] on a body of ``mass`` [kg].
+    """MuJoCo's direct ``solref`` (−s, −b) of a contact of stiffness K [N/m] on a ``mass`` [kg].
 
     MuJoCo's soft constraint obeys a₁ + d (b v + k r) = (1 − d) a₀ with the direct form b = B / d, k = s / d (for a constant
     impedance, d = dmax), r the penetration and a₀ the acceleration without the contact. At rest, with a force F on a mass m,
@@ -35,7 +35,7 @@ def contact_solref(stiffness: float, mass: float, impedance: float = IMPEDANCE) 
 
 
 class PressRig:
-    """One environment: object and case, one driven and one on a mocap body, and one compliant contact between them.
+    """One environment: object and case, one driven, one on a mocap body, and their contact.
 
     The driven side hangs on slides x, y, z and a hinge about z; their values are always those of the object's displacement in the
     pad frame, whichever side moves, so that one trajectory serves both. With the object at T(o) T(q) R(θ) in the pad frame, a
@@ -48,8 +48,11 @@ class PressRig:
     """
 
     def __init__(self, mass: float, stiffest: float, moves: str = "object") -> None:
-        """``mass`` [kg] on the drive; ``stiffest`` [N/m] incremental stiffness that a press may meet: the driven side gets the mass
-        that keeps it stable at the time step of 1 ms (equilibria do not depend on it). ``moves``: ``object`` or ``case``."""
+        """``mass`` [kg] on the drive; ``stiffest`` [N/m]: incremental stiffness of a press.
+
+        The driven side gets the mass that keeps it stable at the time step of 1 ms (equilibria do not depend on it). ``moves``:
+        ``object`` or ``case``.
+        """
         self.mass = max(mass, stiffest * (1.0 - IMPEDANCE) / _STIFFEST)
         self._case_moves = moves == "case"
         spec = mujoco.MjSpec()
@@ -84,9 +87,9 @@ class PressRig:
         self._pad_from_case, self._below = np.zeros(3), 0.0
 
     def place(self, origin: np.ndarray, touch_z: float) -> None:
-        """Put the rig's zero at ``origin`` (3,) [m], pad frame; the foot touches when the object is at z = ``touch_z`` [m] there.
+        """Put the rig's zero at ``origin`` (3,) [m], pad frame.
 
-        With all joints at 0 pad frame and world are one.
+        The foot touches when the object is at z = ``touch_z`` [m] there. With all joints at 0 pad frame and world are one.
         """
         if self._case_moves:
             self.data.mocap_pos[0] = origin
@@ -136,7 +139,7 @@ class PressRig:
         self.data.qpos[self._joints] = values
 
     def hold(self, joints: np.ndarray, secant: Callable[[float], float]) -> float:
-        """Hold the rig at ``joints`` (x, y, z [m], twist [rad]); return the normal force [N] that it takes.
+        """Hold the rig at ``joints`` (x, y, z [m], twist [rad]); return its normal force [N].
 
         Position control without error: the pose is prescribed and MuJoCo's inverse dynamics gives the contact's force at rest.
         ``secant``: F / δ [N/m] of the load law at a depth [m].
@@ -149,7 +152,7 @@ class PressRig:
         return max(-float(self.data.qfrc_inverse[self._z]), 0.0) if self.depth > 0.0 else 0.0
 
     def load(self, start: float, end: float, duration: float, secant: Callable[[float], float]) -> bool:
-        """Ramp the drive's normal force from ``start`` to ``end`` [N] over ``duration`` [s] and let it settle.
+        """Ramp the normal force from ``start`` to ``end`` [N] over ``duration`` [s] and settle.
 
         x, y and twist stay where they are. Returns whether the contact's force settled within 1e-4 of ``end``.
         """

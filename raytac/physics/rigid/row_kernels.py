@@ -1,4 +1,4 @@
-"""Rows of MuJoCo's constraint for contacts of gels: normal spring, shear, spin and tilt of one step, with the friction that bounds them.
+"""Rows of MuJoCo's constraint for gels: normal spring, shear, spin, tilt and friction.
 
 MuJoCo minimises over accelerations a of constraint rows ½ Σ (a − a*)² / R within an elliptic friction cone: a row that is not cut by the
 cone carries f = (a* − a) / R. With R = 1 / (G Δt) and a* = −v / Δt + f₀ / (G Δt) that is f = f₀ − G v₁, v₁ = v + Δt a the speed at the
@@ -11,17 +11,17 @@ end of the step. So every row is a given force and a viscous one at the end of t
 | spin | −k s, the shear's | as of the tangents on the lever of the cone |
 | rolling | −b | N m Δt, m the metacentric height |
 
-The convex cone lifts what slips, which the normal row's f₀ is less by: at the speed at the start of the step, unless a slide begins or ends
-in it. ``Steps.slides`` says where that may be, and MuJoCo's own solution for the end of the step decides then (``correct_lifts``).
+The convex cone lifts what slips, which the normal row's f₀ is less by: at the speed at the start of the step, unless a slide begins or
+ends in it. ``Steps.slides`` says where that may be, and MuJoCo's own solution for the end of the step decides then (``correct_lifts``).
 
-The last row replaces what a single contact point lacks. A flat face that tilts moves the centre of pressure by its spread m per radian, so
-the normal load turns it back with the stiffness N m, taken at the start of a step. That is stable with as much at its end, which the
+The last row replaces what a single contact point lacks. A flat face that tilts moves the centre of pressure by its spread m per radian,
+so the normal load turns it back with the stiffness N m, taken at the start of a step. That is stable with as much at its end, which the
 viscous row gives. Of a ball m is 0.
 
 b is the friction of rolling, 3/16 α a N with α the gel's hysteresis. It builds up while the body rolls on by an eighth of the contact's
-radius a, by the law of P. R. Dahl (A solid friction model, 1968), which takes energy from the smallest rocking: a body whose
-contact moves by r per radian has db = (b_max u − b) 8 r / a |dφ| with u the direction of the angle dφ. r is the lesser
-of the spread s and the height of the centre of mass: R of a ball. A flat face, which tilts rather than rolls, has only r / s of the torque.
+radius a, by the law of P. R. Dahl (A solid friction model, 1968), which takes energy from the smallest rocking: a body whose contact
+moves by r per radian has db = (b_max u − b) 8 r / a |dφ| with u the direction of the angle dφ. r is the lesser of the spread s and the
+height of the centre of mass: R of a ball. A flat face, which tilts rather than rolls, has only r / s of the torque.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -57,20 +57,20 @@ from raytac.physics.rigid.world_kernels import (
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _EDGE = wp.constant(wp.float64(0.7))
-"""Greatest distance of the centre of pressure from the middle of a flat contact over the contact's radius, for its row of tilt."""
+"""Greatest offset of a flat contact's centre of pressure over its radius, in the tilt row."""
 _LEAST = wp.constant(wp.float64(1e-6))
 """Least coefficient of friction, which MuJoCo wants positive."""
 _LEVER = wp.constant(wp.float64(3.0 * 3.141592653589793 / 16.0))
-"""Lever of the torque of spin over the contact's radius: Hertz's contact that slips as a whole."""
+"""Lever of the torque of spin over the radius: Hertz's contact that slips as a whole."""
 _TWIST = wp.constant(wp.vec4d(*TWIST_STIFFENING))
 _ROLLING = wp.constant(wp.float64(3.0 / 16.0))
 """Bound of the friction of rolling, over radius and hysteresis."""
 _GIVE = wp.constant(wp.float64(8.0))
 """Radius of the contact over the distance on which the friction of rolling builds up."""
 _ROOM = wp.constant(wp.float64(4.0))
-"""Cone's bound of rolling over that of its friction, so that this takes 3 % at most from the friction of sliding."""
+"""Cone's bound of rolling over that of friction, to cost sliding at most 3 %."""
 _CHANGE = wp.constant(wp.float64(0.01))
-"""Change of a lift over the normal force from which a slide counts as one that begins or ends."""
+"""Change of a lift over the normal force from which a slide begins or ends."""
 _NAN = wp.constant(wp.float64(float("nan")))
 _ROWS = wp.constant(wp.int32(ROWS))
 _0 = wp.constant(wp.float64(0.0))
@@ -81,7 +81,7 @@ _HALF = wp.constant(wp.float64(0.5))
 
 @wp.func
 def first_tangent(normal: wp.vec3d) -> wp.vec3d:
-    """Unit tangent of a gel along the pad's x as nearly as can be; the second is that turned by 90° about the normal."""
+    """Unit tangent of a gel nearest to the pad's x; the second is 90° on about the normal."""
     return wp.normalize(wp.vec3d(_1, _0, _0) - normal[0] * normal)
 
 
@@ -129,7 +129,7 @@ def set_rows(
     shear: Shear,
     slots: Slots,
 ):
-    """Fill the slots of one search's results with the rows of the step; ``pads`` …: as of ``approach``.
+    """Fill the slots of one search's results with the step's rows; see ``approach``.
 
     ``rolling``: torques of rolling over their bounds, about the pad's tangents.
     """
@@ -262,10 +262,10 @@ def read_rows(
     acceleration: wp.array3d(dtype=wp.float64),
     slots: Slots,
 ):
-    """Let the gels shear by what bodies moved in the step; contacts that have ended are forgotten.
+    """Let the gels shear by what bodies moved in the step; drop contacts that ended.
 
-    ``force`` [N, N m] and ``velocity`` [m/s, rad/s] of rows at the end of the step, each (n, pads, bodies + pads, ROWS). MuJoCo's force is
-    on the second body; the pad gets the opposite, and another gel the opposite of that, about its own origin.
+    ``force`` [N, N m] and ``velocity`` [m/s, rad/s] of rows at the end of the step, each (n, pads, bodies + pads, ROWS). MuJoCo's force
+    is on the second body; the pad gets the opposite, and another gel the opposite of that, about its own origin.
     """
     i, pad, body = wp.tid()
     env, step = steps.envs[i], steps.length[i]
@@ -302,7 +302,7 @@ def read_rows(
 
 @wp.kernel
 def sum_wrenches(slots: Slots, steps: Steps, touched: Touched, wrench: wp.array2d(dtype=wp.spatial_vectord)):
-    """Wrench on each pad, (B, pads), in the order of the slots; 0 in an environment that is lost."""
+    """Wrench on each pad, (B, pads), in the order of the slots; 0 where lost."""
     i, pad = wp.tid()
     if steps.envs[i] < 0:
         return

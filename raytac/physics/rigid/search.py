@@ -1,4 +1,4 @@
-"""Search for contacts of resting pads and rigid bodies, all environments, pads and bodies at once, on the CPU or on CUDA."""
+"""Search for contacts of resting pads and rigid bodies, all at once, on CPU or CUDA."""
 
 from __future__ import annotations
 
@@ -104,9 +104,10 @@ class PadSearch:
         return self._read(self.run(count), envs)
 
     def run(self, count: int) -> int:
-        """Fill ``rows`` from ``poses`` and ``reach`` of the first ``count`` environments, with memory for as many as there are.
+        """Fill ``rows`` from ``poses`` and ``reach`` of the first ``count`` environments.
 
-        Returns their number, for which a device is waited for. More memory is another ``rows``.
+        There is memory for as many rows as there are; more memory is another ``rows``. Returns their number, for which a device is waited
+        for.
         """
         pairs = count * self._shape[0] * self._shape[1]
         if pairs == 0:
@@ -120,7 +121,7 @@ class PadSearch:
         return rows
 
     def launch(self) -> None:
-        """Fill ``rows`` from ``poses`` and ``reach`` of all environments; nothing waits for the device.
+        """Fill ``rows`` from all environments' ``poses`` and ``reach``, without waiting.
 
         Rows follow the order of environments, pads and bodies; ``ends`` (pairs,) holds the number of rows up to each pair. Rows beyond
         those that ``reserve`` made are left out.

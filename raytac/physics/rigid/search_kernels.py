@@ -1,4 +1,4 @@
-"""Search for contacts of resting pads and bodies in Warp: broad phase, grid of nodes, depth, centroid, load law.
+"""Search for contacts in Warp: broad phase, grid of nodes, depth, centroid, load law.
 
 One block of threads measures one pair after the other, so that nothing depends on how many pairs there are. Threads share the nodes of a
 window; sums are those of a tile, in a fixed order. On a CPU a block is one thread.
@@ -44,9 +44,10 @@ from raytac.physics.rigid.shape_kernels import Shapes, infinity
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 PITCHES = 1.6e-3, 0.8e-3, 0.4e-3, 0.2e-3, 0.1e-3, 0.05e-3
-"""Spacings of the nodes [m]: a contact is measured on the first grid of which it covers enough nodes, but not on the coarsest, which only
-says where a convex body may touch. The last two are for bodies that are narrow there: 20 cells of
-the one before if they are convex, else two."""
+"""Spacings of the nodes [m]; a contact is measured on the first that has enough nodes.
+
+The coarsest only says where a convex body may touch. The last two are for bodies that are narrow there: 20 cells of the one before if
+they are convex, else two."""
 ENOUGH = 150
 """Nodes: 96 mm² of the second grid, 24 mm² of the third."""
 _ENOUGH = wp.constant(wp.int32(ENOUGH))
@@ -54,13 +55,15 @@ _FIRST, _LAST = wp.constant(wp.int32(1)), wp.constant(wp.int32(LAST))
 """First and last grid on which bodies that are not narrow are measured."""
 _FINEST = wp.constant(wp.int32(len(PITCHES) - 1))
 _NARROW = wp.constant(wp.float64(0.05))
-"""A grid's spacing over a convex body's least width at most, so that the area of a pin is known."""
+"""Greatest spacing of a grid over a convex body's least width: a pin's area is known."""
 _NEAR = wp.constant(wp.float64(0.75))
-"""Between nodes that all stay this share of the spacing from the gel a body does not touch: a cone of 45° would reach 0.71 further."""
+"""Gap of all nodes, over the spacing, from which a body does not touch between them.
+
+A cone of 45° would reach 0.71 further."""
 _CLOSE = wp.constant(wp.float64(1e-6))
-"""A least gap is near enough to its lower bound with this [m]: parabolas between the nodes come nearer by far."""
+"""Tolerance of a least gap [m] against its lower bound; parabolas come nearer by far."""
 _JUST_TOUCHING = wp.constant(wp.float64(50e-6))
-"""The place of a gap is the centroid of the overlap that the body would have so much deeper [m]."""
+"""Added depth [m] whose overlap's centroid is the place of a gap."""
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
 _2 = wp.constant(wp.float64(2.0))
@@ -69,7 +72,7 @@ _INF = wp.constant(wp.float64(float("inf")))
 _NAN = wp.constant(wp.float64(float("nan")))
 _MANY = wp.constant(wp.int32(0x7FFFFFFF))
 _SEARCH, _ZOOM, _LAW = (wp.constant(wp.int32(k)) for k in range(3))
-"""Purpose of a pass over nodes: to search for an overlap, to measure the least gap about one node, to have a gap's nodes for the law."""
+"""Purpose of a pass over nodes: overlap, least gap about one node, gaps for the law."""
 
 
 @wp.struct
@@ -336,7 +339,7 @@ def measure(
     work: Work,
     rows: Rows,
 ):
-    """Rows of all pairs that are near, in their order; ``ends``: running number of these. Rows beyond the memory are left out."""
+    """Rows of all near pairs, in order, as far as memory goes; ``ends``: their running number."""
     block, lane = wp.tid()
     lanes = wp.block_dim()
     pair = wp.int32(block)

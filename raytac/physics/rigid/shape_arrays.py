@@ -105,7 +105,7 @@ _COLUMNS = {
 
 
 _LEAST_MEMORY = 32768
-"""Nodes that a window may have at least, so that a blade of 0.1 mm across the pad has its finest grid."""
+"""Nodes that a window may have at least: finest grid of a 0.1 mm blade across the pad."""
 
 
 class PadArrays:
@@ -146,7 +146,7 @@ class PadArrays:
 
 
 def _law(gelpad: GelpadSpec) -> np.ndarray:
-    """Constants of ``law_kernels``: 2 E*, radius of the widest contact, and entries of the response."""
+    """Constants of ``law_kernels``: 2 E*, radius of the widest contact, entries."""
     layer = layer_response(gelpad)
     entries = np.stack([layer.stiffening, layer.moment, layer.bend], axis=1).ravel()
     return np.concatenate([[2.0 * reduced_modulus(gelpad), layer.radius[-1]], entries])
@@ -157,7 +157,7 @@ def _array(values: Any, dtype: Any, device: wp.Device) -> wp.array:
 
 
 def _blunt(part: Part) -> float:
-    """Least width [m] of a part's tips and tubes; inf of convex ones without edges sharper than a right angle."""
+    """Least width [m] of tips and tubes; inf if convex with edges of 90° or blunter."""
     if part.kind == "cone":
         return 0.0  # its base's rim is sharp
     if part.kind == "ellipsoid":
@@ -168,7 +168,7 @@ def _blunt(part: Part) -> float:
 
 
 def _ball_and_box(part: Part) -> tuple[np.ndarray, np.ndarray, float]:
-    """Centre and half edges of a box that holds the part, part frame, and radius of a ball about that centre [m]."""
+    """Box around a part, part frame: centre, half edges, radius of a ball about it [m]."""
     if part.kind == "plane":
         return np.zeros(3), np.full(3, np.inf), np.inf
     if part.vertices is not None:

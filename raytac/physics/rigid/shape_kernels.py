@@ -1,4 +1,4 @@
-"""First hit of vertical lines from below with the parts of bodies, in Warp: the same formulas as ``raytac.shapes``, one line at a time.
+"""First hit of vertical lines from below with bodies' parts, by ``raytac.shapes``, in Warp.
 
 A line (x, y, c_z) + t e_z of the pad frame, c the part's origin, is o + t d in the part frame. Lengths are float64 on every device.
 Triangles are searched in float32 by ``wp.mesh_query_ray``; the height on the one that is hit is that of its plane in float64.
@@ -24,7 +24,7 @@ _3 = wp.constant(wp.float64(3.0))
 _HALF = wp.constant(wp.float64(0.5))
 _INF = wp.constant(wp.float64(float("inf")))
 _PARALLEL = wp.constant(wp.float64(1e-14))
-"""Component of d below which a line is parallel to a slab, and its square to a quadric's axis."""
+"""Component of d below which a line is parallel to a slab; its square for a quadric's axis."""
 _SAME_ROOT = wp.constant(wp.float64(1e-15))
 _THIRD_TURN = wp.constant(wp.float64(2.0943951023931953))
 _BARELY_FLAT = wp.constant(wp.float64(1e-12))
@@ -52,7 +52,7 @@ class Shapes:
     width: wp.array(dtype=wp.float64)
     """Of a torus that of its tube, else inf."""
     blunt: wp.array(dtype=wp.float64)
-    """Least width of its tips and tubes; inf of convex parts without edges sharper than a right angle."""
+    """Least width of tips and tubes; inf if convex with edges of 90° or blunter."""
     max_slope: wp.array(dtype=wp.float64)
     mesh: wp.array(dtype=wp.uint64)
     """Triangles about ``centre``."""
@@ -68,7 +68,7 @@ class Shapes:
 
 @wp.func
 def infinity() -> wp.float64:
-    """Infinity in a variable of its own: assigning to a name that was set to the constant itself changes the constant."""
+    """Infinity in a variable of its own: a name set to the constant would change the constant."""
     return _INF
 
 
@@ -211,7 +211,7 @@ def torus_value(t: wp.float64, k: wp.float64, a: wp.float64, b: wp.float64, c: w
 
 @wp.func
 def under_torus(major: wp.float64, minor: wp.float64, o: wp.vec3d, d: wp.vec3d) -> wp.float64:
-    """t of the first root of g, inf where there is none; g and its stretches as in ``raytac.shapes.primitives``."""
+    """t of the first root of g, else inf; g and stretches as in ``raytac.shapes.primitives``."""
     r = minor / major
     p = o / major
     middle = -wp.dot(p, d)
@@ -249,7 +249,7 @@ def under_torus(major: wp.float64, minor: wp.float64, o: wp.vec3d, d: wp.vec3d) 
 
 @wp.func
 def sideways(component: wp.float64) -> wp.float32:
-    """Component of a ray's direction; never 0, for the search divides by it and would multiply infinity by 0 on a box's face."""
+    """Component of a ray's direction, never 0: the search divides by it."""
     if wp.abs(component) < wp.float64(1e-20):
         return wp.float32(1e-20)
     return wp.float32(component)
@@ -305,7 +305,7 @@ def elevation_at(shapes: Shapes, part: wp.int32, x: wp.float64, y: wp.float64) -
 
 @wp.func
 def under_relief(shapes: Shapes, part: wp.int32, o: wp.vec3d, d: wp.vec3d) -> wp.float64:
-    """t of the underside of a relief that looks down, by the iteration of ``raytac.shapes.relief``."""
+    """t of the underside of a relief that looks down, as in ``raytac.shapes.relief``."""
     t = -o[2] / d[2]
     height = wp.float64(0.0)
     for _ in range(60):
@@ -360,7 +360,7 @@ def under_surface(shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.ve
 
 @wp.func
 def first_hit(shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d, x: wp.float64, y: wp.float64) -> wp.float64:
-    """Lowest z [m] of a part at a pose of the pad frame on the vertical line at x, y; inf where the line misses it."""
+    """Lowest z [m] of a part on the vertical line at x, y, pad frame; inf where it misses."""
     if shapes.kind[part] < MESH:
         return under_primitive(shapes.kind[part], shapes.size[part], rotation, at, x, y)
     return under_surface(shapes, part, rotation, at, x, y)
@@ -368,7 +368,7 @@ def first_hit(shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d,
 
 @wp.func
 def part_box(shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d) -> wp.vec3d:
-    """Half edges [m] of a box about the part's centre, axes of the pad frame, that holds it at a pose; inf for a half-space."""
+    """Half edges [m] of a box about the part's centre, pad axes; inf for a half-space."""
     kind, size, half, radius = shapes.kind[part], shapes.size[part], shapes.half[part], shapes.radius[part]
     if kind == PLANE:
         return wp.vec3d(_INF, _INF, _INF)

@@ -1,4 +1,4 @@
-"""Shear of the gel under contacts in Warp: rings that stretch, slip and remember (see ``shear``)."""
+"""Shear of the gel under contacts: rings that stretch, slip and remember (``shear``)."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -17,11 +17,13 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 _RINGS = wp.constant(wp.int32(MOST_RINGS))
 _MOST = wp.constant(wp.float64(MOST_RINGS))
 _LEAST = wp.constant(wp.float64(LEAST_RINGS))
-"""Between both a contact may vibrate while its rings keep their width: the load by a factor of 2.4."""
+"""Least rings of a contact: from these to the most, loads differ by a factor of 2.4.
+
+Within it a contact may vibrate while its rings keep their width."""
 _FRESH = wp.constant(wp.float64(0.01))
-"""Square of the stretch of the outer part of a ring over the inner one's, from which both join."""
+"""Squared stretch of a ring's outer part over the inner's from which both join."""
 _PLAY = wp.constant(wp.float64(0.125))
-"""Share of the contact's radius that its centre may go to and fro over gel and body without rolling: the centroid of nodes jitters."""
+"""Share of the radius that a centroid may jitter over gel and body without rolling."""
 _TINY = wp.constant(wp.float64(1e-30))
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
@@ -31,10 +33,13 @@ _HALF = wp.constant(wp.float64(0.5))
 
 @wp.func
 def begin_shear(shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, stiffness: wp.vec2d, centre: wp.vec3d) -> wp.vec3d:
-    """Elastic force along two tangents and torque about the normal of a contact of shear and twist stiffness.
+    """Elastic force along two tangents and torque about the normal of a contact.
 
-    ``centre`` [m] is where a new one starts. What a contact has grown by since the last step is without stretch; what it has shrunk by
-    leaves with its own.
+    Args:
+        stiffness: against shear and twist.
+        centre: where a new contact starts [m].
+
+    What a contact has grown by since the last step is without stretch; what it has shrunk by leaves with its own.
     """
     before = shear.stiffness[env, pad, body]
     if before[0] > _0:
@@ -75,7 +80,7 @@ def begin_shear(shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, stif
 
 @wp.func
 def weight(low: wp.float64, high: wp.float64) -> wp.vec3d:
-    """Of a ring, in proportion to its stiffness along two tangents and about the normal: as the radius and as its cube."""
+    """Ring's share of stiffness along two tangents and about the normal: radius and its cube."""
     along = high - low
     return wp.vec3d(along, along, along * (low * low + low * high + high * high))
 
@@ -106,10 +111,11 @@ def shrink(shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, size: wp.
 def grow(
     shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, old: wp.float64, size: wp.float64, twist: wp.float64
 ):  # fmt: skip
-    """Add rings without stretch from ``old`` to ``size`` [widths of rings]; ``twist`` over shear stiffness [m²].
+    """Add rings without stretch from ``old`` to ``size`` [widths of rings].
 
-    New area of a ring that has some joins the outer part. Before it does, the outer part joins the inner one, so that the same area leaves
-    again when the contact shrinks. An outer part that is next to without stretch stays: of minima of the load the deepest counts.
+    ``twist``: twist over shear stiffness [m²]. New area of a ring that has some joins the outer part. Before it does, the outer part
+    joins the inner one, so that the same area leaves again when the contact shrinks. An outer part that is next to without stretch stays:
+    of minima of the load the deepest counts.
     """
     k = wp.int32(old)
     low, inner, part = wp.float64(k), shear.inner[env, pad, body, k], old - wp.float64(k)
@@ -127,7 +133,7 @@ def grow(
 
 @wp.func
 def double_width(shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, size: wp.float64):
-    """Rings of twice the width, each of two of a contact of ``size`` [widths of rings], which become its parts."""
+    """Rings of twice the width, each from two of a contact of ``size`` [widths of rings]."""
     k = wp.int32(0)
     while k < _RINGS:
         one, two = 2 * k, 2 * k + 1
@@ -151,7 +157,7 @@ def double_width(shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, siz
 
 @wp.func
 def halve_width(shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, size: wp.float64):
-    """Rings of half the width, two of each of the inner ones of a contact of ``size`` [their widths]; the others are empty."""
+    """Rings of half the width, two of each inner one, for a contact of ``size`` [new widths]."""
     k = _RINGS // 2 - 1
     while k >= 0:
         inner = _2 * shear.inner[env, pad, body, k]
@@ -181,7 +187,7 @@ def halve_whole(shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, k: w
 
 @wp.func
 def limits_of(stiffness: wp.vec2d, limit: wp.vec2d) -> wp.vec2d:
-    """Stretch [m] and rotation [rad] at which the centre slips: what all rings carry at their limits adds up to ``limit``."""
+    """Stretch [m] and rotation [rad] at which the centre slips: rings carry ``limit``."""
     return wp.vec2d(
         wp.float64(1.5) * limit[0] / wp.max(stiffness[0], _TINY), wp.float64(2.5) * limit[1] / wp.max(stiffness[1], _TINY)
     )
@@ -191,7 +197,7 @@ def limits_of(stiffness: wp.vec2d, limit: wp.vec2d) -> wp.vec2d:
 def share_that_sticks(
     shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, displacement: wp.vec3d, limit: wp.vec2d
 ) -> wp.float64:
-    """Stiffness against a displacement over that without slip; 0 where all of the contact would slip.
+    """Stiffness against a displacement over that without slip; 0 if all would slip.
 
     The displacement is one that may come in the step, ``limit`` as in ``move_shear``.
     """
@@ -263,9 +269,10 @@ def move_shear(
 
 @wp.func
 def slipped(stretch: wp.vec3d, along: wp.float64, about: wp.float64, low: wp.float64, high: wp.float64) -> wp.vec3d:
-    """Stretch of a ring between two radii over the contact's, within the limits of the centre times the ring's mean of 1 − y².
+    """Stretch of a ring between two radii over the contact's, within its limits.
 
-    The mean is over its stiffness, which is as y along the tangents and as y³ about the normal.
+    These are those of the centre times the ring's mean of 1 − y². The mean is over its stiffness, which is as y along the tangents and as
+    y³ about the normal.
     """
     square = low * low + low * high + high * high
     fourth = low * low * low * (low + high) + high * high * (low * low + low * high + high * high)
@@ -276,7 +283,7 @@ def slipped(stretch: wp.vec3d, along: wp.float64, about: wp.float64, low: wp.flo
 
 @wp.func
 def rolled(shear: Shear, env: wp.int32, pad: wp.int32, body: wp.int32, centre: wp.vec3d, radius: wp.float64) -> wp.float64:
-    """Distance [m] that a contact has rolled on in the last step: what its centre travels over gel and body alike.
+    """Distance [m] rolled in the last step: what the centre travels over gel and body alike.
 
     A body that shears the gel, or slides, takes the centre with it or leaves it where it is on the gel: one of both is zero. Between
     two gels the centre goes half as far as the body, and back over it.

@@ -27,8 +27,9 @@ class _Member:
 
 
 class ShearState:
-    """Stretch of all contacts: one row for each environment, pad and body. The arrays are views of the kernels'; on CUDA they are copies,
-    which are made when one asks for them.
+    """Stretch of all contacts, a row for each environment, pad and body.
+
+    The arrays are views of the kernels'; on CUDA they are copies, made when one asks for them.
 
     Attributes:
         stretch: displacement [m] along two tangents and rotation [rad] about the normal, of both parts of every ring, from the middle

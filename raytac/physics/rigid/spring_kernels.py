@@ -1,5 +1,6 @@
-"""Normal contact as an implicit spring: the force of one step, linear in the speed at its end, by which it stays stable at any step.
+"""Normal contact as an implicit spring, linear in the speed at the end of a step.
 
+It is stable at any step.
 A contact of depth δ that closes at the speed w at the end of a step Δt carries
 
     f = F(δ) + C w,   C = c K
@@ -27,7 +28,7 @@ from raytac.physics.rigid.table_kernels import Law, force_at
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _HALVINGS = wp.constant(wp.int32(12))
-"""Bisections for the speed at the end of a step: its upper bound is taken, off by a 4000th of the speed at the start."""
+"""Bisections for the speed at a step's end; the upper bound is off by 1/4000 of the first."""
 _SLOW = wp.constant(wp.float64(1e-7))
 """A contact that closes by no more than this in a step [m] is taken to close at its speed."""
 _0 = wp.constant(wp.float64(0.0))
@@ -37,19 +38,19 @@ _HALF = wp.constant(wp.float64(0.5))
 
 @wp.struct
 class Spring:
-    """Normal force f = force + damping · w of one contact in one step, w the speed [m/s] at its end at which it closes."""
+    """Normal force f = force + damping · w of one contact, w the closing speed at the end [m/s]."""
 
     force: wp.float64
     """[N]; negative of a gap that closes within the step."""
     damping: wp.float64
     """C [N s/m]; 0 where no contact is possible in this step."""
     deepest: wp.float64
-    """Depth [m] to which a free pair of bodies would close in the step; of one that touches, at its speed alone."""
+    """Depth [m] to which a free pair would close in the step; at its speed alone if touching."""
 
 
 @wp.func
 def spring_time(stiffness: wp.float64, inverse_mass: wp.float64, step: wp.float64, relaxation: wp.float64) -> wp.float64:
-    """c [s]: the relaxation time, at least between Δt/2 of slow contacts and Δt of those whose own motion a step does not resolve."""
+    """c [s]: relaxation time, or at least Δt/2 of slow and Δt of unresolved contacts."""
     squared = stiffness * inverse_mass * step * step
     return wp.max(relaxation, step * (_HALF + _HALF * squared / (_1 + squared)))
 
@@ -65,7 +66,7 @@ def end_of_step(
     step: wp.float64,
     relaxation: wp.float64,
 ) -> wp.float64:
-    """Depth [m] to which free bodies close in the step: m (v − w) / Δt = f(w) by bisection, f rising in w from ``start`` on."""
+    """Depth [m] of free bodies after the step: m (v − w) / Δt = f(w), f rising from ``start``."""
     low, high = wp.float64(0.0), wp.max(quickest - step * inverse_mass * start, _0)
     if step * high <= _SLOW:
         return depth + step * high
@@ -98,7 +99,6 @@ def normal_spring(
     """Spring of one step of a contact.
 
     Args:
-        rows, law: load law.
         depth: δ [m]; negative is a gap.
         speed: speed [m/s] at which it closes at the start of the step.
         inverse_mass: 1/m of both bodies [1/kg].

@@ -1,6 +1,7 @@
-"""Length of an environment's steps, in Warp: the scene's, halved until nothing moves too far in one near a pad.
+"""Environments that take a step or begin again, and the length of their steps.
 
-Steps are Δt = T / 2^k of the scene's step T. One of 2^k ticks starts at a multiple of itself only, so that all end together at T.
+Steps are Δt = T / 2^k of the scene's step T, halved until nothing near a pad moves too far. One of 2^k ticks starts at a multiple of
+itself only, so that all end together at T.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -13,11 +14,13 @@ from __future__ import annotations
 import warp as wp
 
 from raytac.physics.rigid.contact_rows import Rows
-from raytac.physics.rigid.table_kernels import Law, force_at
+from raytac.physics.rigid.shear_kernels import clear_shear
+from raytac.physics.rigid.table_kernels import Law, force_at, radius_at
 from raytac.physics.rigid.world_kernels import (
     Differences,
     Gels,
     Motion,
+    Shear,
     Slots,
     Steps,
     Touched,
@@ -28,8 +31,8 @@ from raytac.physics.rigid.world_kernels import (
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
-_TRAVEL = wp.constant(wp.float64(0.025))
-"""Greatest share of the gel's thickness by which a contact closes or opens in a step."""
+_TRAVEL = wp.constant(wp.float64(0.05))
+"""Most closing or opening of any place of a contact in a step, over the gel's thickness."""
 _SWING = wp.constant(wp.float64(0.02))
 """Share of the thickness from which a contact that swings on its own stiffness is resolved …"""
 _PHASE = wp.constant(wp.float64(0.1))
@@ -38,6 +41,7 @@ _SLACK = wp.constant(wp.float64(1.0 + 1e-9))
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
 _INF = wp.constant(wp.float64(float("inf")))
+_NAN = wp.constant(wp.float64(float("nan")))
 
 
 @wp.func
@@ -55,19 +59,20 @@ def law_of(
 
 @wp.func
 def longest_step(
-    depth: wp.float64, speed: wp.float64, rate: wp.float64, acceleration: wp.float64, thickness: wp.float64
+    depth: wp.float64, speed: wp.float64, tilting: wp.float64, rate: wp.float64, acceleration: wp.float64, thickness: wp.float64
 ) -> wp.float64:
     """Longest step [s] of one contact.
 
     Args:
         depth: δ [m], negative is a gap.
         speed: at which it closes [m/s].
+        tilting: speed at which its rim closes on one side and opens on the other, as the body tilts [m/s].
         rate: angular frequency [1/s] of the bodies on the spring between them, as deep as it goes in the scene's step.
         acceleration: of closing in the last step [m/s²].
         thickness: of the gel [m].
     """
     quick = wp.max(wp.abs(speed), wp.float64(1e-12))
-    inside = _TRAVEL * thickness / quick
+    inside = _TRAVEL * thickness / (quick + tilting)
     if wp.length(wp.vec2d(speed, acceleration / rate)) / rate > _SWING * thickness:
         inside = wp.min(inside, _PHASE / rate)
     if depth > _0:
@@ -97,7 +102,7 @@ def approach(
     steps: Steps,
     slots: Slots,
 ):
-    """Slots of one search's results: the speed at which each closes, and the step that it allows.
+    """Slots of one search's results: the closing speed of each, and the step it allows.
 
     ``pads``, ``bodies``: of the search, which begin with ``first_pad``, ``first_body`` of the slots. What has no law has gone through the
     gel, as two gels that overlap by more than one of them: its environment is lost. Where the compliance is 0 neither body moves.
@@ -122,11 +127,13 @@ def approach(
     left = timestep * (_1 - wp.float64(steps.done[i]) / wp.float64(scene_ticks))
     depth = rows.depth[row]
     deeper = depth + wp.min(wp.max(speed, _0) * left, _TRAVEL * thickness)
-    stiffness = force_at(rows, law_of(rows, row, vary, gels, touched, env, pad, body), deeper)[1]
+    law = law_of(rows, row, vary, gels, touched, env, pad, body)
+    stiffness = force_at(rows, law, deeper)[1]
+    tilting = wp.length(wp.cross(spin, rows.normal[row])) * radius_at(rows, law, deeper)
     slots.row[i, pad, body] = row
     slots.speed[i, pad, body] = speed
     slots.longest[i, pad, body] = longest_step(
-        depth, speed, wp.sqrt(stiffness * compliance), acceleration[env, pad, body], thickness
+        depth, speed, tilting, wp.sqrt(stiffness * compliance), acceleration[env, pad, body], thickness
     )
 
 
@@ -163,3 +170,38 @@ def choose_steps(motion: Motion, slots: Slots, timestep: wp.float64, scene_ticks
     steps.length[i] = timestep * wp.float64(ticks) / wp.float64(scene_ticks)
     steps.contacts[i] = 0
     steps.slides[i] = 0
+
+
+@wp.kernel
+def choose_active(active: wp.array(dtype=wp.bool), steps: Steps):
+    """Let row i of the next step be environment i where ``active``, else none, at tick 0."""
+    i = wp.tid()
+    steps.envs[i] = wp.where(active[i], i, -1)
+    steps.done[i] = 0
+
+
+@wp.kernel
+def clear_environments(
+    mask: wp.array(dtype=wp.bool),
+    # outputs
+    shear: Shear,
+    before: wp.array3d(dtype=wp.mat44d),
+    acceleration: wp.array3d(dtype=wp.float64),
+    rolling: wp.array3d(dtype=wp.vec2d),
+    wrenches: wp.array2d(dtype=wp.spatial_vectord),
+):
+    """Forget contacts, poses of the last step and wrenches of the environments of a mask (B,)."""
+    env, pad, body = wp.tid()
+    if not mask[env]:
+        return
+    clear_shear(shear, env, pad, body)
+    acceleration[env, pad, body] = _0
+    rolling[env, pad, body] = wp.vec2d()
+    if body < before.shape[2]:
+        pose = wp.mat44d()
+        for k in range(4):
+            for m in range(4):
+                pose[k, m] = _NAN
+        before[env, pad, body] = pose
+    if body == 0:
+        wrenches[env, pad] = wp.spatial_vectord()

@@ -1,8 +1,8 @@
-"""Load law of a contact from its table, with the hard back of the gel, once continuously differentiable; in Warp.
+"""Load law of a contact from its table, with the gel's hard back, smooth once; in Warp.
 
-Between entries the force is a cubic Hermite spline, and the radius a straight line, over the root of the depth, in which a table is evenly
-spaced. The slopes are bounded, so that a spline of rising entries rises everywhere (F. N. Fritsch, R. E. Carlson, SIAM J. Numer. Anal. 17,
-1980). Beyond the last entry the law goes on straight. It is that of ``LoadTables``.
+Between entries the force is a cubic Hermite spline, and the radius a straight line, over the root of the depth, in which a table is
+evenly spaced. The slopes are bounded, so that a spline of rising entries rises everywhere (F. N. Fritsch, R. E. Carlson, SIAM J. Numer.
+Anal. 17, 1980). Beyond the last entry the law goes on straight. It is that of ``LoadTables``.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -54,7 +54,7 @@ def slope_between(before: wp.float64, after: wp.float64) -> wp.float64:
 
 @wp.func
 def hard_back(depth: wp.float64, limit: wp.float64, thickness: wp.float64) -> wp.vec2d:
-    """Factor of the law near the bonded face, and its derivative by depth [1/m]; see ``load_law.hard_back``."""
+    """Factor of the law near the bonded face, and its derivative [1/m]; ``load_law.hard_back``."""
     remaining = wp.max((limit - depth) / thickness, wp.float64(1e-6))
     above = wp.max(_HARD_FROM / remaining - _1, _0)
     return wp.vec2d(_1 + _HARD_RISE * above * above, _2 * _HARD_RISE * above * _HARD_FROM / (remaining * remaining * thickness))
@@ -62,7 +62,7 @@ def hard_back(depth: wp.float64, limit: wp.float64, thickness: wp.float64) -> wp
 
 @wp.func
 def force_at(rows: Rows, law: Law, depth: wp.float64) -> wp.vec2d:
-    """Force [N] and incremental stiffness [N/m]; at depths <= 0 no force, and the stiffness of the first touch."""
+    """Force [N] and stiffness [N/m]; at depths <= 0 no force, and that of the first touch."""
     row, deepest = law.row, rows.deepest[law.row]
     deep = wp.max(depth, deepest * _FIRST)
     at = wp.sqrt(deep / deepest) * _ENTRIES

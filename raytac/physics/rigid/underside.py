@@ -1,4 +1,4 @@
-"""Undersides of all bodies over the pads of one sensor, all environments at once, on the CPU or on CUDA."""
+"""Undersides of all bodies over the pads of one sensor, all environments at once."""
 
 from __future__ import annotations
 
@@ -19,16 +19,19 @@ from raytac.warp_runtime import start_warp
 
 @dataclass(frozen=True)
 class Underside:
-    """Undersides over n pads, pad frame [m]; on the CPU views, which may be changed and which the next call overwrites."""
+    """Undersides over n pads, pad frame [m].
+
+    On the CPU they are views, which may be changed and which the next call overwrites.
+    """
 
     height: np.ndarray
-    """Lowest z of all bodies (n, Ny, Nx) where they are lower than the resting gel and not beyond its bonded face, else inf."""
+    """Lowest z of all bodies (n, Ny, Nx) between resting gel and bonded face, else inf."""
     depth: np.ndarray
     """Greatest overlap of each body with the resting gel (n, bodies), −inf without."""
     behind: np.ndarray
     """True where a body is beyond the bonded face on some line (n, bodies), bool."""
     window: np.ndarray
-    """Columns from, to and rows from, to (n, 4) of the nodes whose ``height`` is finite, zeros for none."""
+    """Columns from, to and rows from, to (n, 4) of finite nodes of ``height``; 0 for none."""
 
 
 class Undersides:
@@ -42,7 +45,7 @@ class Undersides:
     def __init__(
         self, grid: PadGrid, thickness: float, bodies: Sequence[Sequence[Part]], *, num_envs: int, device: str = "cpu"
     ) -> None:
-        """``grid``: nodes of the pad; ``thickness`` of its gel [m]; bodies by their parts, body frame."""
+        """``grid`` of the pad; ``thickness`` of its gel [m]; bodies by their parts, body frame."""
         start_warp()
         self.device, self._grid, self._bodies = wp.get_device(device), grid, len(bodies)
         self._shapes = ShapeArrays(bodies, self.device)
@@ -79,7 +82,7 @@ class Undersides:
         return Underside(height, depth, behind != 0, window)
 
     def launch(self, count: int | None = None) -> None:
-        """Fill the outputs of the first ``count`` environments, None for all; nothing waits for the device."""
+        """Fill the outputs of the first ``count`` environments (None: all), without waiting."""
         count = len(self.sound) if count is None else count
         if count == 0:
             return

@@ -1,4 +1,4 @@
-"""Kernels of ``Undersides``: parts placed before a pad, their undersides by rows of nodes, overlaps of each body."""
+"""Kernels of ``Undersides``: parts placed before a pad, undersides by rows, overlaps."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -45,7 +45,7 @@ class Before:
     bottom: wp.array2d(dtype=wp.float64)
     """Lower bound of z over the pad."""
     window: wp.array2d(dtype=wp.vec4i)
-    """Columns from, to and rows from, to of the nodes over which the part may be lower than the gel."""
+    """Columns from, to and rows from, to where the part may be lower than the gel."""
 
 
 @wp.func
@@ -104,7 +104,7 @@ def place(
 
 @wp.func
 def inverse_of(d: wp.float64) -> wp.float64:
-    """1 / d; of a line parallel to a slab so large that the line is inside from far below to far above, or nowhere."""
+    """1 / d, finite: a line parallel to a slab is inside from far below to far above, or never."""
     if wp.abs(d) < _PARALLEL:
         return _1 / _PARALLEL
     return _1 / d

@@ -1,8 +1,8 @@
-"""Arrays that the kernels of a world's pads share: gels, bodies, differences of environments, and slots of environment, pad and body.
+"""Arrays that the kernels of a world's pads share: gels, bodies, differences, slots.
 
-A slot's body is one of the ``bodies`` that pads touch, or another pad's gel: gel k is body ``bodies`` + k. The kernels work on n rows, the
-environments of this step, in the order of ``envs``, and skip the rows after these. What lasts from step to step has one entry for each of
-all B environments.
+A slot's body is one of the ``bodies`` that pads touch, or another pad's gel: gel k is body ``bodies`` + k. The kernels work on n rows,
+the environments of this step, in the order of ``envs``, and skip the rows after these. What lasts from step to step has one entry for
+each of all B environments.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -129,7 +129,7 @@ class Slots:
     regularisation: wp.array4d(dtype=wp.float64)
     """R, (…, ROWS)."""
     bend: wp.array3d(dtype=wp.vec2d)
-    """Share of the torque of rolling that builds up per angle about each tangent of the row [1/rad]."""
+    """Share of the torque of rolling that builds up per angle about each tangent [1/rad]."""
     lift: wp.array3d(dtype=wp.float64)
     """Normal force that MuJoCo's cone adds, which f₀ is without [N]."""
     compliance: wp.array3d(dtype=wp.float64)
@@ -151,7 +151,7 @@ class Steps:
     done: wp.array(dtype=wp.int32)
     """Ticks of the scene's step that are done."""
     most: wp.array(dtype=wp.int32)
-    """Greatest number of steps, with this one, in which the rest of the scene's step is done; 0 is any."""
+    """Most steps, with this one, in which the rest of the scene's step is done; 0 is any."""
     ticks: wp.array(dtype=wp.int32)
     """Ticks of this step."""
     length: wp.array(dtype=wp.float64)
@@ -161,7 +161,7 @@ class Steps:
     contacts: wp.array(dtype=wp.int32)
     """Contacts of gels that are held."""
     slides: wp.array(dtype=wp.int32)
-    """1 where a contact may begin or end to slide in this step, so that its lift is not known yet."""
+    """1 where a contact may begin or end to slide, so that its lift is not known yet."""
 
 
 @wp.struct

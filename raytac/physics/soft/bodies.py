@@ -82,7 +82,6 @@ def scene_body(
     """A body from its parts, body frame.
 
     Args:
-        name: unique in its scene.
         parts: shape. ``half_space`` takes none (the solid is z <= 0 of its frame) or one ``plane``.
         kind: ``kinematic``: rigid, with prescribed poses. ``affine``: near-rigid and free. ``soft``: neo-Hookean, free, or driven where
             ``bonded``. ``half_space``: a table or wall.
@@ -90,7 +89,6 @@ def scene_body(
         youngs_modulus, poisson_ratio: of a soft body [Pa], [-].
         cell: edge length of a soft body's tetrahedra [m]. A box becomes a grid of mirrored cells; all else is meshed by pytetwild.
         bonded: of a soft body: mask (n,) of the vertices (n, 3) [m] that are fixed to the body's frame; None: it is free.
-        friction: see ``SceneBody``.
         sag: greatest distance of facets inside a curved part [m].
 
     Raises:

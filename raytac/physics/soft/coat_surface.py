@@ -108,7 +108,7 @@ class BarrierClearance:
 
     The barrier holds the coat's facets slightly off the object, and where the coat wraps a curved object its vertices lie deeper than
     its facets. Both are artefacts of the discretisation: a real coat touches. Let c = underside of the object − smooth coat. The
-    clearance is the mean of c weighted by pressure, over samples that bear pressure and where c is no more than barrier and sag explain.
+    clearance is the mean of c weighted by pressure, over samples under pressure and where c is no more than barrier and sag explain.
     A larger c is a recess of the object. Facets sag only where the object is convex, that is lower than its own mean over a cell.
 
     The object is shown lower than the solver has it by this clearance, and a press to a depth drives it higher by as much: the coat, not

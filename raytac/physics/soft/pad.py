@@ -56,7 +56,7 @@ class SoftPad(PressPad):
         """Mesh the pad, make the object's surface and put both into the solver.
 
         Args:
-            level: a name of ``PAD_LEVELS``, or a mesh of one's own.
+            level: a name of ``PAD_LEVELS``, or a mesh of the user's.
             correction, control: as in ``Ipc``.
             device: where the solver runs, ``cpu`` or ``cuda``.
             sensor, scene, settings: as of ``PressPad``.
@@ -91,8 +91,7 @@ class SoftPad(PressPad):
     def follow(self, stage: StageSpec, steps: int = 1) -> Iterator[PadReading]:
         """Readings along one more stage, as of ``PressPad``.
 
-        Raises:
-            InputError: also for a stage deeper than any of the scene's: there the object's surface was left out.
+        Raises ``InputError``: also for a stage deeper than any of the scene's: there the object's surface was left out.
         """
         if stage.kind == "indent" and (stage.depth or self.sensor.gelpad.thickness) > self._deepest:
             rule = f"must not go deeper than the scene's deepest stage, {self._deepest * 1e3:.4g} mm (a force may go as deep as the pad)"

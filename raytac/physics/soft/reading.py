@@ -184,7 +184,7 @@ class SoftReader:
         return state.vertices[b, :, 2] - self.mesh.coat.rest[:, 2]
 
     def _bears(self, load: np.ndarray) -> np.ndarray:
-        """Mask (Ny, Nx) of the nodes in cells of which a vertex bears a ``load`` (V,) [N]."""
+        """Mask (Ny, Nx) of the nodes in cells of which a vertex has a ``load`` (V,) [N]."""
         mesh = self.mesh.coat
         at_y, at_x = hat_matrix(mesh.lines_y, self.grid.y), hat_matrix(mesh.lines_x, self.grid.x)
         return at_y @ load.reshape(mesh.shape) @ at_x.T > 0.0

@@ -19,9 +19,9 @@ from raytac.report.image_error import METRICS
 KEYS = {"mae": "mae_levels", "rmse": "rmse_levels", "psnr": "psnr_db", "ssim": "ssim", "flip": "flip"}
 
 
-def select(rows: Iterable[Row], **wanted: object) -> list[Row]:
-    """Rows whose figures have the values ``wanted``."""
-    return [row for row in rows if all(row.figures[key] == value for key, value in wanted.items())]
+def select(rows: Iterable[Row], **values: object) -> list[Row]:
+    """Rows whose figures have these ``values``."""
+    return [row for row in rows if all(row.figures[key] == value for key, value in values.items())]
 
 
 def resolutions(rows: Iterable[Row]) -> list[str]:
@@ -145,9 +145,9 @@ def _equal_error(resolution: str, scene: str, family: str, target: float, ms: fl
     reached = target >= errors[-1]
     if not reached and not sampled[0].figures["unbiased"]:
         return EqualError(resolution, scene, family, target, None, None, "not reached")
-    wanted = spp_for_error(spp, errors, target)
+    needed = spp_for_error(spp, errors, target)
     how = "interpolated" if reached else "extrapolated as 1/√spp"
-    return EqualError(resolution, scene, family, target, wanted, cost_at(spp, times, wanted) / ms, how)
+    return EqualError(resolution, scene, family, target, needed, cost_at(spp, times, needed) / ms, how)
 
 
 def compare_metrics(comparison: Comparison) -> dict[str, Metric]:
@@ -243,6 +243,6 @@ def spp_for_error(spp: Sequence[int], errors: Sequence[float], target: float) ->
     return float(np.exp(np.interp(-np.log(target), falling, np.log(spp))))
 
 
-def cost_at(spp: Sequence[int], ms: Sequence[float], wanted: float) -> float:
-    """Time [ms] at ``wanted`` samples: linear between points, proportional beyond the last."""
-    return float(ms[-1] * wanted / spp[-1]) if wanted > spp[-1] else float(np.interp(wanted, spp, ms))
+def cost_at(spp: Sequence[int], ms: Sequence[float], samples: float) -> float:
+    """Time [ms] at ``samples`` samples: linear between points, proportional beyond the last."""
+    return float(ms[-1] * samples / spp[-1]) if samples > spp[-1] else float(np.interp(samples, spp, ms))

@@ -48,8 +48,7 @@ class PeerTaxim:
     def __init__(self, size: tuple[int, int], *, shadow: bool, device: str) -> None:
         """``size`` (width, height) [px]; ``device``: ``cpu``, or ``cuda`` with a JAX built for it.
 
-        Raises:
-            BackendError: the package or JAX is not installed or does not start on ``device``.
+        Raises ``BackendError``: the package or JAX is not installed or does not start on ``device``.
         """
         if importlib.util.find_spec("taxim") is None:
             raise BackendError("the package taxim is not installed (`pip install taxim[jax-cpu]` adds it as a peer)")

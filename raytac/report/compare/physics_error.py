@@ -49,8 +49,6 @@ def physics_errors(
     """Press every scene into the soft pad and compare.
 
     Args:
-        tracers: the sensor's ray tracers.
-        scenes: press scenes.
         size: (width, height) of the images [px].
         pad: level of the soft pad.
         surfaces: the rigid pad's, by name of scene.

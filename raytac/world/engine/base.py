@@ -1,4 +1,4 @@
-"""``Engine``: what steps the bodies of B environments, with room for the contacts of gels between the halves of a step.
+"""``Engine``: stepper of B environments with room for the contacts of gels in a step.
 
 ``RigidPads`` is the order of a step for engines that the host steps; ``MujocoWarp.advance`` is the same order for one that it does not::
 
@@ -48,11 +48,11 @@ class Engine(Protocol):
         ...
 
     def free_acceleration(self) -> None:
-        """Accelerations that everything but contacts and other constraints would give, by the controls."""
+        """Accelerations by the controls, without contacts and other constraints."""
         ...
 
     def read_frames(self) -> object:
-        """Write ``contact.frames``: frames of pads and of what they touch, velocities and free accelerations.
+        """Write ``contact.frames``: frames of pads and bodies, velocities, free accelerations.
 
         It launches kernels only, the same ones each time, so that it can be recorded with ``contact.begin``. Before ``free_acceleration``
         the accelerations are those of an earlier step.
@@ -60,8 +60,9 @@ class Engine(Protocol):
         ...
 
     def put_contacts(self, *, own_step: bool = True) -> None:
-        """Put the contacts of ``contact.slots`` among MuJoCo's own, with their regularisation and reference accelerations.
+        """Put the contacts of ``contact.slots`` among MuJoCo's own.
 
+        They keep their regularisation and reference accelerations.
         Where a slide may begin or end (``contact.steps.slides``), the lift of MuJoCo's cone is solved for. An environment whose memory
         for contacts is full is lost. ``own_step``: ``end_step`` follows, not a step of somebody else.
         """
@@ -72,7 +73,7 @@ class Engine(Protocol):
         ...
 
     def read_rows(self) -> object:
-        """Write ``contact.force`` and ``contact.velocity``: of the gels' rows, at the end of the step.
+        """Write ``contact.force`` and ``contact.velocity`` of the gels' rows at the step's end.
 
         Environments are lost in which a number is not finite, or a joint is far too fast. It launches kernels only, as ``read_frames``.
         """
@@ -83,7 +84,7 @@ class Engine(Protocol):
         ...
 
     def read_poses(self) -> tuple[np.ndarray, np.ndarray]:
-        """``world_from_pad`` (B, pads, 4, 4) and ``world_from_body`` (B, bodies, 4, 4) on the host, of all environments.
+        """``world_from_pad`` (B, pads, 4, 4) and ``world_from_body`` (B, bodies, 4, 4), on the host.
 
         They are those that the last ``begin_step`` or ``update_poses`` computed.
         """
@@ -92,11 +93,10 @@ class Engine(Protocol):
     def prepare(self) -> None:
         """Take over models that a variation changed; once before the steps of a call.
 
-        Raises:
-            InputError: a model was changed so that pads cannot act, or contacts were lost for want of memory.
+        Raises ``InputError``: a model was changed so that pads cannot act, or contacts were lost for want of memory.
         """
         ...
 
     def invalid(self) -> np.ndarray:
-        """True (B,) on the host for states that cannot be stepped: a number is not finite, or a joint is far too fast."""
+        """True (B,) on the host for states not finite or with a joint far too fast."""
         ...

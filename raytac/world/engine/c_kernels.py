@@ -1,4 +1,4 @@
-"""Kernels on the memory of MuJoCo's states: frames and velocities, contacts of gels and their constraint rows, forces.
+"""Kernels on the memory of MuJoCo's states: frames, contacts of gels, rows, forces.
 
 One thread works on one environment's arena, in which contacts and rows lie one after the other.
 """
@@ -25,6 +25,15 @@ _BACK = wp.constant(wp.float64(0.1))
 """Share of a penetration that a step takes back."""
 _FITS = wp.constant(wp.float64(0.005))
 """Error of a lift over the normal force that is left."""
+_BESIDE = wp.constant(wp.float64(1e-4))
+"""Distance from a box from which a point of a gap is not on it [m]."""
+_OPEN = wp.constant(wp.float64(2e-5))
+"""Gap [m] of a contact without friction before and after a step; load closes it nearer."""
+_FAR = wp.constant(wp.float64(1.0))
+"""Gap that no step closes [m]."""
+_SLOWEST = wp.constant(wp.float64(1e-9))
+"""Least speed by which a gap is divided [m/s]."""
+_HALF = wp.constant(wp.float64(0.5))
 _LARGEST_SPEED = wp.constant(wp.float64(LARGEST_SPEED))
 _MANY = wp.constant(wp.int32(0x7FFFFFFF))
 _0 = wp.constant(wp.float64(0.0))
@@ -33,7 +42,7 @@ _1 = wp.constant(wp.float64(1.0))
 
 @wp.struct
 class Memory:
-    """Addresses of B states, and where their members lie: offsets of pointers [8 byte] and of numbers [4 byte]."""
+    """Addresses of B states, and offsets of pointers [8 byte] and numbers [4 byte] in them."""
 
     states: wp.array(dtype=wp.uint64)
     nq: wp.int32
@@ -64,6 +73,8 @@ class Memory:
     efc_vel: wp.int32
     efc_aref: wp.int32
     efc_force: wp.int32
+    geom_xpos: wp.int32
+    geom_xmat: wp.int32
     # Of a contact: its size and its members, [8 byte] and [4 byte].
     size: wp.int32
     dist: wp.int32
@@ -94,8 +105,13 @@ def integers(memory: Memory, env: wp.int32, member: wp.int32):
 
 
 @wp.func
+def vector_at(values: wp.array(dtype=wp.float64), first: wp.int32) -> wp.vec3d:
+    return wp.vec3d(values[first], values[first + 1], values[first + 2])
+
+
+@wp.func
 def vector(values: wp.array(dtype=wp.float64), index: wp.int32) -> wp.vec3d:
-    return wp.vec3d(values[3 * index], values[3 * index + 1], values[3 * index + 2])
+    return vector_at(values, 3 * index)
 
 
 @wp.func
@@ -124,7 +140,7 @@ def read_frames(
     # outputs
     frames: Frames,
 ):
-    """Frames of pads, at their sites, and of bodies, with their velocities and free accelerations.
+    """Frames of pads, at their sites, and of bodies, with velocities and free accelerations.
 
     ``bodies``: those that carry the pads first; ``roots``: of their kinematic trees; ``last``: last degree of freedom that moves each, −1
     of none; ``parents``: of the degrees of freedom; ``share``: of each one's acceleration that comes, as damping is implicit
@@ -163,7 +179,7 @@ def read_frames(
 
 @wp.kernel
 def write_contacts(memory: Memory, steps: Steps, slots: Slots, gels: wp.array(dtype=wp.int32), others: wp.array(dtype=wp.int32)):
-    """Fill the last contacts with those of the slots that are held. ``gels``, ``others``: geoms of the pads and of all that they touch."""
+    """Fill the last contacts with the slots'; ``gels``, ``others``: geoms of pads and bodies."""
     i = wp.tid()
     if steps.lost[i] != 0 or steps.contacts[i] == 0:
         return
@@ -232,40 +248,6 @@ def is_among(geoms: wp.array(dtype=wp.int32), geom: wp.int32) -> wp.int32:
     return geoms[geom]
 
 
-@wp.kernel
-def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(dtype=wp.int32)):
-    """Set the reference accelerations after ``mj_referenceConstraint``: of the last rows, and of contacts of geoms that are ``hard``."""
-    i = wp.tid()
-    if steps.lost[i] != 0:
-        return
-    env, step = steps.envs[i], steps.length[i]
-    count = number(memory, env, memory.ncon) - steps.contacts[i]
-    velocity = doubles(memory, env, memory.efc_vel)
-    reference = doubles(memory, env, memory.efc_aref)
-    contact = doubles(memory, env, memory.contact)
-    integer = integers(memory, env, memory.contact)
-    for k in range(count):
-        at = 2 * k * memory.size
-        one, two, first = integer[at + memory.geom], integer[at + memory.geom + 1], integer[at + memory.efc_address]
-        if first >= 0 and integer[at + memory.dim] >= 3 and is_among(hard, one) + is_among(hard, two) > 0:
-            gap = contact[k * memory.size + memory.dist]
-            # A gap is closed by the step exactly, and a penetration is taken back slowly.
-            wanted = wp.where(gap > _0, gap, _BACK * gap) / step
-            reference[first] = -(velocity[first] + wanted) / step
-            reference[first + 1] = -velocity[first + 1] / step
-            reference[first + 2] = -velocity[first + 2] / step
-    row = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
-    for pad in range(slots.held.shape[1]):
-        for body in range(slots.held.shape[2]):
-            if slots.held[i, pad, body] != 0:
-                m = wp.int32(0)
-                while m < _ROWS:
-                    wanted = slots.force[i, pad, body, m] * slots.regularisation[i, pad, body, m]
-                    reference[row] = wanted - velocity[row] / step
-                    row += 1
-                    m += 1
-
-
 @wp.func
 def row_times(memory: Memory, env: wp.int32, row: wp.int32, values: wp.array(dtype=wp.float64)) -> wp.float64:
     """A row of the constraint's Jacobian times a vector of the degrees of freedom."""
@@ -281,9 +263,93 @@ def row_times(memory: Memory, env: wp.int32, row: wp.int32, values: wp.array(dty
     return result
 
 
+@wp.func
+def is_box(boxes: wp.array(dtype=wp.vec3d), geom: wp.int32) -> wp.bool:
+    """False of −1, which is a flex."""
+    if geom < 0:
+        return False
+    return boxes[geom][0] > wp.float64(0.0)
+
+
+@wp.func
+def beside_box(memory: Memory, env: wp.int32, geom: wp.int32, half: wp.vec3d, point: wp.vec3d) -> wp.float64:
+    """Distance [m] of a point from a box, along the axis on which it is farthest out; 0 inside."""
+    turn = matrix(doubles(memory, env, memory.geom_xmat), geom)
+    local = wp.transpose(turn) * (point - vector(doubles(memory, env, memory.geom_xpos), geom))
+    return wp.max(wp.max(wp.abs(local[0]) - half[0], wp.abs(local[1]) - half[1]), wp.max(wp.abs(local[2]) - half[2], _0))
+
+
+@wp.func
+def passes(
+    memory: Memory, env: wp.int32, one: wp.int32, two: wp.int32, boxes: wp.array(dtype=wp.vec3d), near: wp.vec3d, far: wp.vec3d,
+    moved: wp.vec3d,
+) -> wp.bool:  # fmt: skip
+    """True if two boxes pass each other, so that their gap is no contact once it is closed.
+
+    Its points ``near`` and ``far`` are not on the boxes, or neither is on the other box once the second one has moved.
+    """
+    off = wp.max(beside_box(memory, env, one, boxes[one], near), beside_box(memory, env, two, boxes[two], far))
+    by = wp.min(beside_box(memory, env, one, boxes[one], far + moved), beside_box(memory, env, two, boxes[two], near - moved))
+    return wp.max(off, by) > _BESIDE
+
+
+@wp.kernel
+def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(dtype=wp.int32), boxes: wp.array(dtype=wp.vec3d)):
+    """Set reference accelerations of the last rows and ``hard`` geoms, after MuJoCo's own.
+
+    ``boxes``: half edges of geoms that are boxes, else 0.
+    """
+    i = wp.tid()
+    if steps.lost[i] != 0:
+        return
+    env, step = steps.envs[i], steps.length[i]
+    count = number(memory, env, memory.ncon) - steps.contacts[i]
+    velocity = doubles(memory, env, memory.efc_vel)
+    reference, smooth = doubles(memory, env, memory.efc_aref), doubles(memory, env, memory.qacc_smooth)
+    contact = doubles(memory, env, memory.contact)
+    integer = integers(memory, env, memory.contact)
+    for k in range(count):
+        at = 2 * k * memory.size
+        one, two, first = integer[at + memory.geom], integer[at + memory.geom + 1], integer[at + memory.efc_address]
+        if first >= 0 and integer[at + memory.dim] >= 3 and is_among(hard, one) + is_among(hard, two) > 0:
+            n = k * memory.size
+            gap = contact[n + memory.dist]
+            # A gap is closed by the step exactly, and a penetration is taken back slowly.
+            wanted = wp.where(gap > _0, gap, _BACK * gap) / step
+            open = wp.bool(False)
+            ahead, free = wp.vec3d(), wp.vec3d()
+            if gap > _0:
+                for m in range(3):
+                    free[m] = row_times(memory, env, first + m, smooth)
+                    ahead[m] = velocity[first + m] + step * free[m]
+                open = gap > _OPEN and gap + step * ahead[0] > _OPEN
+                if is_box(boxes, one) and is_box(boxes, two):
+                    at = n + memory.frame
+                    frame = wp.matrix_from_rows(vector_at(contact, at), vector_at(contact, at + 3), vector_at(contact, at + 6))
+                    middle, shift = vector_at(contact, n + memory.pos), _HALF * gap * frame[0]
+                    until = wp.min(step, gap / wp.max(-ahead[0], _SLOWEST))
+                    moved = wp.transpose(frame) * wp.vec3d(-gap, until * ahead[1], until * ahead[2])
+                    if passes(memory, env, one, two, boxes, middle - shift, middle + shift, moved):
+                        wanted, open = _FAR / step, wp.bool(True)
+            reference[first] = -(velocity[first] + wanted) / step
+            for m in range(1, 3):
+                # MuJoCo's cone acts across a gap that is smaller than the friction times the slide of the step.
+                reference[first + m] = wp.where(open, free[m], -velocity[first + m] / step)
+    row = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
+    for pad in range(slots.held.shape[1]):
+        for body in range(slots.held.shape[2]):
+            if slots.held[i, pad, body] != 0:
+                m = wp.int32(0)
+                while m < _ROWS:
+                    wanted = slots.force[i, pad, body, m] * slots.regularisation[i, pad, body, m]
+                    reference[row] = wanted - velocity[row] / step
+                    row += 1
+                    m += 1
+
+
 @wp.kernel
 def correct_lifts(memory: Memory, steps: Steps, slots: Slots):
-    """Set the lifts in environments with a slide that begins or ends by the speeds of MuJoCo for the end of the step.
+    """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step.
 
     A slide that is faster by a lift that is larger asks for more: the first guess follows from the contact's own mass, the others by
     secants. ``steps.slides`` stays 1 until the lift fits.

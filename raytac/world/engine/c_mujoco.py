@@ -1,6 +1,7 @@
-"""C MuJoCo under rigid pads: one ``MjData`` an environment, whose memory kernels read and write for all environments at once.
+"""C MuJoCo under rigid pads: one ``MjData`` an environment.
 
-Contacts of gels are put among MuJoCo's own between ``mj_step1`` and ``mj_step2``.
+Kernels read and write its memory for all environments at once. Contacts of gels are put among MuJoCo's own between ``mj_step1`` and
+``mj_step2``.
 """
 
 from __future__ import annotations
@@ -30,13 +31,14 @@ from raytac.world.engine.c_kernels import (
     write_regularisation,
 )
 from raytac.world.environment_models import EnvironmentModels
+from raytac.world.hard_contacts import box_sizes
 from raytac.world.implicit_damping import ImplicitDamping
 from raytac.world.pad_contact import PadIndices, last_dofs
 from raytac.world.world_state import lost
 
 
 class CMujoco:
-    """States of B environments that C MuJoCo steps, each by the length of its own step; see ``Engine``.
+    """States of B environments that C MuJoCo steps, each by its own step; see ``Engine``.
 
     Attributes:
         divides, device: as of ``Engine``.
@@ -56,7 +58,6 @@ class CMujoco:
         """Prepare the kernels.
 
         Args:
-            contact: the gels' contacts, on the CPU.
             pads: what the models call pads and what they touch.
             models: of the environments; a variation may replace one.
             datas: their states; ``bind`` names others.
@@ -100,7 +101,7 @@ class CMujoco:
             for kernel, more in (
                 (write_contacts, [gels, others]),
                 (write_regularisation, []),
-                (write_references, [_array(pads.hard)]),
+                (write_references, [_array(pads.hard), wp.array(box_sizes(model), dtype=wp.vec3d, device="cpu")]),
                 (correct_lifts, []),
             )
         )
@@ -116,8 +117,7 @@ class CMujoco:
     def prepare(self) -> None:
         """Take over models that were replaced.
 
-        Raises:
-            InputError: a model has another timestep than at first, or a cone in which pads cannot act.
+        Raises ``InputError``: a model has another timestep than at first, or a cone in which pads cannot act.
         """
         models = [self._models_now[b] for b in range(len(self._datas))]
         if not same_states(models, self._models):
@@ -156,7 +156,7 @@ class CMujoco:
             mujoco.mj_kinematics(self._models[b], self._datas[b])
 
     def read_poses(self) -> tuple[np.ndarray, np.ndarray]:
-        """``world_from_pad`` (B, pads, 4, 4) and ``world_from_body`` (B, bodies, 4, 4), as the last step or ``update_poses`` left them."""
+        """``world_from_pad`` and ``world_from_body`` of the last step or ``update_poses``."""
         if self._poses is None:
             members = {"pads": site_pose(self._pads.sites), "bodies": body_pose(self._pads.bodies)}
             self._poses = StateReader(self._datas, members)
@@ -168,7 +168,7 @@ class CMujoco:
         return self._contact.chosen
 
     def put_contacts(self, *, own_step: bool = True) -> None:
-        """As of ``Engine``; an environment whose memory for contacts is full is lost with a ``RuntimeWarning``."""
+        """As of ``Engine``; where memory is full an environment is lost with a ``RuntimeWarning``."""
         self._damping.clear()
         envs, blank, views = self._envs(), self._blank, self._views
         count = len(envs)
@@ -215,7 +215,7 @@ class CMujoco:
         self._foresee_slides(envs, views.slides[:count], views.lost[:count])
 
     def _foresee_slides(self, envs: Sequence[int], slides: np.ndarray, lost: np.ndarray) -> None:
-        """Solve where a slide may begin or end, until its lift fits the speed at the end of the step."""
+        """Solve where a slide may begin or end, until its lift fits the step's last speed."""
         for _ in range(_SOLVES):
             some = np.flatnonzero(slides & (lost == 0)).tolist()
             if not some:
@@ -225,7 +225,10 @@ class CMujoco:
             self._correct()
 
     def end_step(self) -> None:
-        """``mj_step2`` of the length of each environment's step, if it is not lost; afterwards the models have their timestep again."""
+        """``mj_step2`` by each environment's step, unless it is lost.
+
+        Afterwards the models have their timestep again.
+        """
         envs, timestep = self._envs(), self._timestep
         models, datas, options, views = self._models, self._datas, self._options, self._views
         lengths, lost = views.length[: len(envs)].tolist(), views.lost[: len(envs)].tolist()
@@ -270,6 +273,7 @@ def _blank() -> mujoco.MjContact:
 _POINTERS = (
     "contact", "qpos", "qvel", "xpos", "xmat", "site_xpos", "site_xmat", "subtree_com", "cvel", "cdof", "qacc_smooth", "qacc",
     "qacc_warmstart", "efc_J_rownnz", "efc_J_rowadr", "efc_J_colind", "efc_J", "efc_D", "efc_R", "efc_vel", "efc_aref", "efc_force",
+    "geom_xpos", "geom_xmat",
 )  # fmt: skip
 _DOUBLES = ("dist", "pos", "frame", "friction", "mu")
 _INTEGERS = ("dim", "geom1", "geom2", "geom", "efc_address")

@@ -1,8 +1,8 @@
-"""MuJoCo Warp under rigid pads: B worlds in one state, on the CPU or on CUDA, with the contacts of gels in its contact list.
+"""MuJoCo Warp under rigid pads: B worlds in one state, on the CPU or on CUDA.
 
-Nothing in a step waits for the device, so that a step can be recorded as one CUDA graph (``capture``). All worlds take as many steps, each
-of its own length. None can be left out of one: a world that is not active, has done the scene's step already, or breaks down, is put back
-to where the step began.
+The contacts of gels are in its contact list. Nothing in a step waits for the device, so that a step can be recorded as one CUDA graph
+(``capture``). All worlds take as many steps, each of its own length. None can be left out of one: a world that is not active, has done
+the scene's step already, or breaks down, is put back to where the step began.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from raytac.robots.states import Numbers, body_pose, site_pose
 from raytac.warp_runtime import start_warp
 from raytac.world.engine import mjwarp_kernels as kernels
 from raytac.world.environment_models import EnvironmentModels
+from raytac.world.hard_contacts import box_sizes
 from raytac.world.implicit_damping import ImplicitDamping
 from raytac.world.pad_contact import PadIndices, last_dofs
 from raytac.world.world_state import LARGEST_SPEED
@@ -31,17 +32,20 @@ from raytac.world.world_state import LARGEST_SPEED
 _SLIDES = 2
 """Solves for the lift of a slide that begins or ends, before that of the step."""
 _TOLERANCE = 1e-8
-"""Gain of an iteration, over the trace of the mass matrix, at which the solver stops. An arm makes that trace large, so that MuJoCo Warp's
-own 1e-6 is coarse for a light body beside it."""
+"""Gain of an iteration at which the solver stops, over the trace of the mass matrix.
+
+An arm makes that trace large, so that MuJoCo Warp's own 1e-6 is coarse for a light body beside it."""
 _VARIED = (
     "body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "dof_invweight0", "tendon_invweight0", "actuator_acc0", "body_pos",
     "body_quat", "geom_friction",
 )  # fmt: skip
-"""Members of MuJoCo's model that a variation changes, with those that MuJoCo derives from them."""
+"""Members of MuJoCo's model that a variation changes, with those derived from them."""
 
 
 class MujocoWarp:
-    """States of B environments of one model in one state of MuJoCo Warp; see ``Engine``. Row i of a step is environment i.
+    """States of B environments in one state of MuJoCo Warp; see ``Engine``.
+
+    They have one model. Row i of a step is environment i.
 
     Attributes:
         divides, device: as of ``Engine``.
@@ -69,7 +73,6 @@ class MujocoWarp:
         """Make the states, all at ``qpos0``.
 
         Args:
-            contact: the gels' contacts, on the device of all.
             pads: what the models call pads and what they touch.
             models: of the environments; a variation may replace one.
             timestep: of the scene's steps [s], which divide into shorter ones; None is the models'.
@@ -123,13 +126,17 @@ class MujocoWarp:
             self._sites, self._bodies, self._last = (_array(values) for values in (pads.sites, bodies, last_dofs(model, bodies)))
             self._share = wp.array(damping.share, dtype=wp.float64)
             self._others, self._hard = _array(pads.geoms), _array(pads.hard)
+            self._boxes = wp.array(box_sizes(model), dtype=wp.vec3)
             self._gels = _array(pads.geoms[len(pads.bodies) :])
         self._models = [models[0]] * num_envs
         self._take_models()
         self._poses = self.reader({"pads": site_pose(pads.sites), "bodies": body_pose(pads.bodies)})
 
     def _use_gel_contacts(self) -> None:
-        """Room for contacts of ``ROWS`` rows, which the model's own geoms may not have, and a timestep for each environment."""
+        """Room for contacts of ``ROWS`` rows, and a timestep for each environment.
+
+        The model's own geoms may not have such contacts.
+        """
         model, data = self.model, self.data
         if model.nmaxcondim < ROWS:
             model.nmaxcondim, model.nmaxpyramid = ROWS, 2 * (ROWS - 1)
@@ -163,7 +170,7 @@ class MujocoWarp:
         self.check_overflow()
 
     def _take_models(self) -> None:
-        """Give environments the masses, friction and mounting of their models where these were replaced."""
+        """Give environments the masses, friction and mounting of models that were replaced."""
         models = [self._models_now[b] for b in range(self.num_envs)]
         if all(one is other for one, other in zip(models, self._models, strict=True)):
             return
@@ -180,7 +187,7 @@ class MujocoWarp:
         return fast | ~np.isfinite(self.data.qpos.numpy()).all(axis=1)
 
     def choose(self, *, scene_steps: int = 1, launched: int = 0, launches: int = 1) -> None:
-        """Name the environments of the next step: those that are active and have not done all steps of the scene.
+        """Name the next step's environments: active, with steps of the scene to do.
 
         Args:
             scene_steps: number of these.
@@ -196,7 +203,7 @@ class MujocoWarp:
         self._launch(kernels.read_frames, shape, [*frames, self._share, self._contact.frames])
 
     def put_contacts(self, *, own_step: bool = True) -> None:
-        """As of ``Engine``, and make all constraints; a contact for which there is no memory is an error of ``prepare``."""
+        """As of ``Engine``, with all constraints; ``prepare`` reports contacts without memory."""
         worlds, own, mjw = self._worlds, self._own, self._mjw
         slots, steps = self._contact.slots, self._contact.steps
         with wp.ScopedDevice(self.device):
@@ -206,7 +213,7 @@ class MujocoWarp:
             wp.copy(own.first, self.data.nacon)
             self._launch(kernels.append_contacts, own.contact.shape, [worlds, steps, slots, self._gels, self._others, own])
             mjw.make_constraint(self.model, self.data)
-            hard = [worlds, own, self._hard, self.model.opt.timestep]
+            hard = [worlds, own, self._hard, self._boxes, self.model.opt.timestep]
             self._launch(kernels.write_hard_references, self.data.naconmax, hard)
             self._launch(kernels.write_rows, own.contact.shape, [worlds, steps, slots, own])
             for _ in range(_SLIDES):
@@ -290,7 +297,7 @@ class MujocoWarp:
         self._launch(kernels.write_controls, values.shape, [actuators, values, self.data.ctrl])
 
     def capture(self, step: Callable[[], None]) -> Callable[[], None]:
-        """A function that does what ``step`` launches, as one graph on CUDA; ``step`` runs once before. On the CPU ``step`` itself."""
+        """Graph of what ``step`` launches on CUDA, else ``step``; ``step`` runs once before."""
         step()
         if self.device.is_cpu:
             return step
@@ -300,13 +307,13 @@ class MujocoWarp:
         return lambda: wp.capture_launch(graph)
 
     def reset(self, chosen: wp.array, qpos: wp.array, ctrl: wp.array) -> None:
-        """Put the environments that are ``chosen`` (B,), bool, to positions (B, nq) and controls (B, nu), at rest and at the time 0."""
+        """Put ``chosen`` (B,), bool, to positions (B, nq) and controls (B, nu), at rest, time 0."""
         with wp.ScopedDevice(self.device):
             self._mjw.reset_data(self.model, self.data, reset=chosen)
         self._launch(kernels.place_states, self.num_envs, [chosen, qpos, ctrl, self._worlds, self.active])
 
     def check_overflow(self) -> None:
-        """Raise ``InputError`` if contacts or rows were lost since the states were made; it waits for the device."""
+        """Raise ``InputError`` if contacts or rows were lost so far; waits for the device."""
         contacts, pairs, rows, overflow = self.peaks.numpy().tolist()
         lost = [one for one in self._mjw.OverflowType if one & overflow and one.name in _LOST]
         if not lost:
@@ -414,6 +421,7 @@ def _array(values: np.ndarray) -> wp.array:
 
 _DATA = (
     "time", "qpos", "qvel", "act", "ctrl", "qacc", "qacc_smooth", "qacc_warmstart", "M", "xpos", "xmat", "site_xpos", "site_xmat",
+    "geom_xpos", "geom_xmat",
     "subtree_com", "cvel", "cdof", "nacon", "ncollision", "nefc", "overflow",
 )  # fmt: skip
 _CONTACT = (

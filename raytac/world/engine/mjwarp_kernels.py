@@ -1,4 +1,4 @@
-"""Kernels on the state of MuJoCo Warp: frames and velocities, contacts of gels and their constraint rows, forces.
+"""Kernels on the state of MuJoCo Warp: frames, contacts of gels, rows, forces.
 
 MuJoCo Warp keeps the states of all environments in arrays of float32, and their contacts in one list. Its cone has one ratio of
 regularisations for all contacts, R₁/R₀ = 1/impratio. A gel's contact has its own. With the second and third axis of the contact's frame
@@ -30,6 +30,14 @@ _BACK = wp.constant(wp.float32(0.1))
 """Share of a penetration that a step takes back."""
 _FITS = wp.constant(wp.float64(0.005))
 """Error of a lift over the normal force that is left."""
+_BESIDE = wp.constant(wp.float32(1e-4))
+"""Distance from a box from which a point of a gap is not on it [m]."""
+_OPEN = wp.constant(wp.float32(2e-5))
+"""Gap [m] of a contact without friction before and after a step; load closes it nearer."""
+_FAR = wp.constant(wp.float32(1.0))
+"""Gap that no step closes [m]."""
+_SLOWEST = wp.constant(wp.float32(1e-6))
+"""Least speed by which a gap is divided [m/s]."""
 _LARGEST_SPEED = wp.constant(wp.float32(LARGEST_SPEED))
 _IMPEDANCE = wp.constant(wp.float32(0.9))
 _CONSTRAINT = wp.constant(wp.int32(1))
@@ -41,7 +49,7 @@ _1 = wp.constant(wp.float64(1.0))
 
 @wp.struct
 class Worlds:
-    """Arrays of MuJoCo Warp's model and data that the kernels read and write, under its own names."""
+    """Arrays of MuJoCo Warp's model and data that kernels read and write, by its names."""
 
     sparse: wp.int32
     """1 where it keeps the Jacobian of constraints sparse."""
@@ -62,6 +70,8 @@ class Worlds:
     xmat: wp.array2d(dtype=wp.mat33)
     site_xpos: wp.array2d(dtype=wp.vec3)
     site_xmat: wp.array2d(dtype=wp.mat33)
+    geom_xpos: wp.array2d(dtype=wp.vec3)
+    geom_xmat: wp.array2d(dtype=wp.mat33)
     subtree_com: wp.array2d(dtype=wp.vec3)
     cvel: wp.array2d(dtype=wp.spatial_vector)
     cdof: wp.array2d(dtype=wp.spatial_vector)
@@ -131,7 +141,7 @@ def place_states(
     worlds: Worlds,
     active: wp.array(dtype=wp.bool),
 ):
-    """Set positions (B, nq) and controls (B, nu) of the environments that are ``chosen``, which are active from now on."""
+    """Set positions (B, nq) and controls (B, nu) of ``chosen`` environments; now active."""
     i = wp.tid()
     if chosen[i]:
         active[i] = True
@@ -186,9 +196,9 @@ def choose_worlds(
     done: wp.array(dtype=wp.int32),
     steps: Steps,
 ):
-    """Every environment has its own row; left out are those that are not ``active`` or have done all steps of the scene.
+    """Choose a step's environments: ``active`` ones that have steps of the scene to do.
 
-    ``ticks`` of each of the ``scene_steps``; ``launched``: steps before this one, of all ``launches``.
+    Every environment has its own row. ``ticks`` of each of the ``scene_steps``; ``launched``: steps before this one, of all ``launches``.
     """
     i = wp.tid()
     if launched == 0:
@@ -209,7 +219,7 @@ def read_elapsed(done: wp.array(dtype=wp.int32), tick: wp.float64, elapsed: wp.a
 
 @wp.kernel
 def end_worlds(steps: Steps, done: wp.array(dtype=wp.int32), active: wp.array(dtype=wp.bool)):
-    """Count the ticks of a step; an environment whose physics broke down in it is no longer ``active``."""
+    """Count the ticks of a step; where physics broke down, clear ``active``."""
     i = wp.tid()
     if steps.envs[i] >= 0:
         done[i] = done[i] + steps.ticks[i]
@@ -235,11 +245,11 @@ def read_frames(
     # outputs
     frames: Frames,
 ):
-    """Frames of pads, at their sites, and of bodies, with their velocities and free accelerations.
+    """Frames of pads, at their sites, and of bodies, with velocities and free accelerations.
 
     ``bodies``: those that carry the pads first; ``last``: last degree of freedom that moves each, −1 of none; ``share``: of the
-    acceleration of each that comes, as damping is implicit (``ImplicitDamping``). As in a constraint row, the accelerations hold nothing of
-    what velocities alone give.
+    acceleration of each that comes, as damping is implicit (``ImplicitDamping``). As in a constraint row, the accelerations hold nothing
+    of what velocities alone give.
     """
     i, k = wp.tid()
     body = bodies[k]
@@ -324,7 +334,7 @@ def append_contacts(
 
 @wp.kernel
 def write_rows(worlds: Worlds, steps: Steps, slots: Slots, own: Own):
-    """Set stiffness and reference acceleration of the gels' rows, after MuJoCo has made them; scaled by t (see the module)."""
+    """Set stiffness and reference acceleration of MuJoCo's rows of gels, scaled by t (module)."""
     i, pad, body = wp.tid()
     k = own.contact[i, pad, body]
     if k < 0:
@@ -348,26 +358,6 @@ def is_among(geoms: wp.array(dtype=wp.int32), geom: wp.int32) -> wp.int32:
     return geoms[geom]
 
 
-@wp.kernel
-def write_hard_references(worlds: Worlds, own: Own, hard: wp.array(dtype=wp.int32), timestep: wp.array(dtype=wp.float32)):
-    """Set the reference accelerations of MuJoCo's own contacts with geoms that are ``hard``."""
-    k = wp.tid()
-    if k >= wp.min(own.first[0], worlds.nacon[0]) or worlds.type[k] & _CONSTRAINT == 0 or worlds.dim[k] < 3:
-        return
-    geom, row = worlds.geom[k], worlds.efc_address[k, 0]
-    if row < 0 or is_among(hard, geom[0]) + is_among(hard, geom[1]) == 0:
-        return
-    i = worlds.worldid[k]
-    step, gap = timestep[i % timestep.shape[0]], worlds.dist[k]
-    # A gap is closed by the step exactly, and a penetration is taken back slowly.
-    wanted = wp.where(gap > wp.float32(0.0), gap, _BACK * gap) / step
-    worlds.aref[i, row] = -(worlds.vel[i, row] + wanted) / step
-    for m in range(1, 3):
-        other = worlds.efc_address[k, m]
-        if other >= 0:
-            worlds.aref[i, other] = -worlds.vel[i, other] / step
-
-
 @wp.func
 def row_times(worlds: Worlds, i: wp.int32, row: wp.int32, values: wp.array2d(dtype=wp.float32)) -> wp.float64:
     """A row of the constraint's Jacobian times a vector of the degrees of freedom."""
@@ -382,9 +372,78 @@ def row_times(worlds: Worlds, i: wp.int32, row: wp.int32, values: wp.array2d(dty
     return result
 
 
+@wp.func
+def is_box(boxes: wp.array(dtype=wp.vec3), geom: wp.int32) -> wp.bool:
+    """False of −1, which is a flex."""
+    if geom < 0:
+        return False
+    return boxes[geom][0] > wp.float32(0.0)
+
+
+@wp.func
+def beside_box(worlds: Worlds, i: wp.int32, geom: wp.int32, half: wp.vec3, point: wp.vec3) -> wp.float32:
+    """Distance [m] of a point from a box, along the axis on which it is farthest out; 0 inside."""
+    local = wp.transpose(worlds.geom_xmat[i, geom]) * (point - worlds.geom_xpos[i, geom])
+    out = wp.max(wp.abs(local[0]) - half[0], wp.abs(local[1]) - half[1])
+    return wp.max(out, wp.max(wp.abs(local[2]) - half[2], wp.float32(0.0)))
+
+
+@wp.func
+def passes(
+    worlds: Worlds, i: wp.int32, geom: wp.vec2i, boxes: wp.array(dtype=wp.vec3), near: wp.vec3, far: wp.vec3, moved: wp.vec3
+) -> wp.bool:
+    """As of ``c_kernels``."""
+    one, two = boxes[geom[0]], boxes[geom[1]]
+    off = wp.max(beside_box(worlds, i, geom[0], one, near), beside_box(worlds, i, geom[1], two, far))
+    by = wp.min(beside_box(worlds, i, geom[0], one, far + moved), beside_box(worlds, i, geom[1], two, near - moved))
+    return wp.max(off, by) > _BESIDE
+
+
+@wp.kernel
+def write_hard_references(
+    worlds: Worlds, own: Own, hard: wp.array(dtype=wp.int32), boxes: wp.array(dtype=wp.vec3), timestep: wp.array(dtype=wp.float32)
+):
+    """Set the reference accelerations of MuJoCo's own contacts with geoms that are ``hard``.
+
+    ``boxes``: half edges of geoms that are boxes, else 0.
+    """
+    k = wp.tid()
+    if k >= wp.min(own.first[0], worlds.nacon[0]) or worlds.type[k] & _CONSTRAINT == 0 or worlds.dim[k] < 3:
+        return
+    geom, row = worlds.geom[k], worlds.efc_address[k, 0]
+    if row < 0 or is_among(hard, geom[0]) + is_among(hard, geom[1]) == 0:
+        return
+    i = worlds.worldid[k]
+    step, gap = timestep[i % timestep.shape[0]], worlds.dist[k]
+    # A gap is closed by the step exactly, and a penetration is taken back slowly.
+    wanted = wp.where(gap > wp.float32(0.0), gap, _BACK * gap) / step
+    open = wp.bool(False)
+    ahead, free = wp.vec3(), wp.vec3()
+    if gap > wp.float32(0.0):
+        for m in range(3):
+            other = worlds.efc_address[k, m]
+            if other >= 0:
+                free[m] = wp.float32(row_times(worlds, i, other, worlds.qacc_smooth))
+                ahead[m] = worlds.vel[i, other] + step * free[m]
+        open = gap > _OPEN and gap + step * ahead[0] > _OPEN
+        if is_box(boxes, geom[0]) and is_box(boxes, geom[1]):
+            frame = worlds.frame[k]
+            shift = wp.float32(0.5) * gap * frame[0]
+            until = wp.min(step, gap / wp.max(-ahead[0], _SLOWEST))
+            moved = wp.transpose(frame) * wp.vec3(-gap, until * ahead[1], until * ahead[2])
+            if passes(worlds, i, geom, boxes, worlds.pos[k] - shift, worlds.pos[k] + shift, moved):
+                wanted, open = _FAR / step, wp.bool(True)
+    worlds.aref[i, row] = -(worlds.vel[i, row] + wanted) / step
+    for m in range(1, 3):
+        other = worlds.efc_address[k, m]
+        if other >= 0:
+            # MuJoCo's cone acts across a gap that is smaller than the friction times the slide of the step.
+            worlds.aref[i, other] = wp.where(open, free[m], -worlds.vel[i, other] / step)
+
+
 @wp.kernel
 def begin_correction(worlds: Worlds, steps: Steps, own: Own):
-    """Note where slides are not known yet; the next solve, which differs by a lift, begins with this solution."""
+    """Note where slides are unknown; the next solve, with another lift, begins with this one."""
     i = wp.tid()
     own.sliding[i] = steps.slides[i]
     steps.slides[i] = 0
@@ -394,7 +453,7 @@ def begin_correction(worlds: Worlds, steps: Steps, own: Own):
 
 @wp.kernel
 def correct_lifts(worlds: Worlds, own: Own, steps: Steps, slots: Slots):
-    """Set the lifts in environments with a slide that begins or ends by the speeds of MuJoCo for the end of the step.
+    """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step.
 
     A slide that is faster by a lift that is larger asks for more: the first guess follows from the contact's own mass, the others by
     secants. ``steps.slides`` stays 1 until the lift fits.
@@ -437,7 +496,7 @@ def correct_lifts(worlds: Worlds, own: Own, steps: Steps, slots: Slots):
 def add_damping(
     worlds: Worlds, steps: Steps, always: wp.int32, damped: wp.array2d(dtype=wp.float32), mass: wp.array2d(dtype=wp.float32)
 ):
-    """Keep the mass matrix, and put that with the damping of a step where gels touch, or ``always`` (see ``implicit_damping``)."""
+    """Keep the mass matrix; add damping where gels touch or ``always`` (``implicit_damping``)."""
     i, k = wp.tid()
     mass[i, k] = worlds.M[i, k]
     if (always != 0 or steps.contacts[i] > 0) and steps.lost[i] == 0:
@@ -446,8 +505,9 @@ def add_damping(
 
 @wp.kernel
 def end_states(worlds: Worlds, saved: Saved, steps: Steps, losses: wp.int32, peaks: wp.array(dtype=wp.int32)):
-    """Mark environments whose physics broke down, and put them and those left out back to where the step began.
+    """Mark environments whose physics broke down; put them and those left out back.
 
+    They go to where the step began.
     A number is not finite then, a joint is far too fast, or MuJoCo Warp has lost contacts for want of memory, as one of the flags
     ``losses`` says: of the list that all share it cannot say whose.
 

@@ -8,8 +8,8 @@ from raytac.world.hard_contacts import HARD_MARGIN
 
 _SHORTEST = 1e-6
 """Steps are not shorter than this, or half of it [s]."""
-_TRAVEL = 0.025
-"""Greatest share of the gel's thickness by which a contact closes or opens in a step."""
+TRAVEL = 0.05
+"""Greatest share of the gel's thickness by which any place of a contact closes or opens in a step."""
 _SWING = 0.02
 """Share of the thickness from which a contact that swings on its own stiffness is resolved …"""
 _PHASE = 0.1
@@ -27,20 +27,28 @@ class StepChoice:
         """Parts of the scene's step."""
 
     def longest(
-        self, depth: np.ndarray, speed: np.ndarray, rate: np.ndarray, acceleration: np.ndarray, thickness: np.ndarray
+        self,
+        depth: np.ndarray,
+        speed: np.ndarray,
+        tilting: np.ndarray,
+        rate: np.ndarray,
+        acceleration: np.ndarray,
+        thickness: np.ndarray,
     ) -> np.ndarray:
         """Longest step (n,) [s] for n contacts.
 
         Args:
             depth: δ [m], negative is a gap.
             speed: at which they close [m/s].
+            tilting: speed at which their rims close on one side and open on the other [m/s].
             rate: angular frequency of the contact [1/s] as deep as it goes in the scene's step.
             acceleration: of closing in the last step [m/s²].
             thickness: of the gel [m].
         """
-        travel, quick = _TRAVEL * thickness, np.maximum(np.abs(speed), 1e-12)
+        quick = np.maximum(np.abs(speed), 1e-12)
+        travel = TRAVEL * thickness / (quick + tilting)
         swings = np.hypot(speed, acceleration / rate) / rate > _SWING * thickness
-        inside = np.where(swings, np.minimum(travel / quick, _PHASE / rate), travel / quick)
+        inside = np.where(swings, np.minimum(travel, _PHASE / rate), travel)
         # Up to the gel in one step, into it in short ones.
         before = np.where(speed > 0.0, np.maximum(np.maximum(-depth, 0.0) / quick, inside), np.inf)
         return np.where(depth > 0.0, inside, before)

@@ -24,7 +24,7 @@ from tests.physics.rigid.oracle_pierced import BondedFaces
 from tests.physics.rigid.oracle_rows import gel_rows, rolled_on, row_axes, slip_levers
 from tests.physics.rigid.oracle_shear import ShearOracle
 from tests.physics.rigid.oracle_spring import contact_rate, normal_spring
-from tests.physics.rigid.oracle_steps import StepChoice
+from tests.physics.rigid.oracle_steps import TRAVEL, StepChoice
 from tests.physics.rigid.sheared import Sheared
 
 MINI = load_sensor("gelsight_mini").gelpad
@@ -223,10 +223,11 @@ class Step:
     def _lengths(self) -> tuple[np.ndarray, np.ndarray]:
         contacts, thickness = self.contacts, self.thickness(self.contacts)
         env = contacts.env
-        deeper = contacts.depth + np.minimum(np.maximum(self.speed, 0.0) * self.left[env], 0.025 * thickness)
-        rate = contact_rate(self.law(contacts).force(deeper)[1], self.compliance)
-        acceleration = self.state.acceleration[env, contacts.pad, contacts.body]
-        each = self.choice.longest(contacts.depth, self.speed, rate, acceleration, thickness)
+        deeper = contacts.depth + np.minimum(np.maximum(self.speed, 0.0) * self.left[env], TRAVEL * thickness)
+        law, at = self.law(contacts), (env, contacts.pad, contacts.body)
+        rate = contact_rate(law.force(deeper)[1], self.compliance)
+        tilting = np.linalg.norm(cross(self.motion.spin[at], contacts.normal), axis=-1) * law.radius(deeper)
+        each = self.choice.longest(contacts.depth, self.speed, tilting, rate, self.state.acceleration[at], thickness)
         longest = np.minimum(self.case_step.min(axis=1), TIMESTEP)
         np.minimum.at(longest, env, each)
         self.ticks = self.choice.rounded(longest, self.state.done)

@@ -22,6 +22,7 @@ from raytac.world.environment_models import EnvironmentModels, Variation
 from raytac.world.gel_pairs import GelPairs
 from raytac.world.pad_contact import PadIndices, gel_contact
 from raytac.world.world_model import WorldModel, own_world_model
+from tests.world.beside import POSES, SPEED, free_fall, scene
 from tests.world.test_implicit_damping import plunger
 
 mujoco_warp = pytest.importorskip("mujoco_warp")
@@ -282,6 +283,21 @@ def test_an_option_with_which_pads_cannot_act_is_refused() -> None:
         setattr(wrong.opt, option, value)
         with pytest.raises(InputError, match=f"model.opt.{option}"):
             Warped([wrong], composed)
+
+
+@pytest.mark.parametrize("timestep", [2e-3, 1e-2])
+def test_boxes_fall_freely_beside_a_case(timestep: float) -> None:
+    """As on C MuJoCo; one world for each pose."""
+    composed = compose(scene(timestep), "rigid")
+    worlds = Warped([composed.model] * len(POSES), composed)
+    worlds.data.qpos.assign(np.array(list(POSES.values()), np.float32))
+    velocity = np.zeros((len(POSES), 6), np.float32)
+    velocity[:, 2] = -SPEED
+    worlds.data.qvel.assign(velocity)
+    for k in range(round(0.05 / timestep)):
+        worlds.step()
+        expected = np.tile(free_fall(timestep * (k + 1)), (len(POSES), 1))
+        np.testing.assert_allclose(worlds.data.qvel.numpy(), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("task", ["push_cube", "balance_pole", "lift_cube", "roll_ball"])

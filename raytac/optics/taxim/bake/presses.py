@@ -2,7 +2,7 @@
 
 A real calibration (Taxim's, some fifty presses of one ball) has steep slopes where the ball is and none elsewhere. Here the balls
 differ in size and depth and follow a sequence that fills the space of place × size × depth evenly, so that every slope and direction
-comes up all over the view. Most press with the gel around them giving way (``raytac.gel.pyramid``), as all presses of the rigid pad do;
+comes up all over the view. Most press with the gel around them yielding (``raytac.gel.pyramid``), as all presses of the rigid pad do;
 the others are *bare* caps, which reach slopes that the surround would round off.
 """
 

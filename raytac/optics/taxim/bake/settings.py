@@ -27,7 +27,7 @@ class BakeSettings:
     deepest_share: float = 0.3
     """Deepest press as a share of the pad's thickness."""
     bare_share: float = 0.4
-    """Share of images whose balls press without the gel around them giving way."""
+    """Share of images whose balls press without the gel around them yielding."""
     n_bins: int = 125
     """Bins of the slope's magnitude, and of its direction (upstream: 125)."""
     neighbours: float = 0.3

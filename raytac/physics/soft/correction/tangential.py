@@ -225,7 +225,7 @@ class FrictionCorrection:
     def _mesh_forces(self, compliance: np.ndarray, displacement: np.ndarray) -> np.ndarray:
         """Forces [N] whose linear response is ``displacement`` [m], (n,), by conjugate gradients.
 
-        Unknowns that cannot move (the pad's sides across themselves, whose rows of ``compliance`` are 0) bear no force.
+        Unknowns that cannot move (the pad's sides across themselves, whose rows of ``compliance`` are 0) have no force.
         """
         free = np.diagonal(compliance) > 0.0
         A, b = np.ascontiguousarray(compliance[np.ix_(free, free)]), displacement[free]
