@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import NoReturn
 
 import mujoco
 import numpy as np
@@ -53,6 +54,12 @@ class CStates:
     def values(self) -> dict[str, np.ndarray]:
         """Present ``state_numbers``, (B, …) each."""
         return self._reader.values()
+
+    def read(self, name: str) -> NoReturn:
+        """Raise ``InputError``: readings on a device need MuJoCo Warp."""
+        raise InputError(
+            "engine", value="mujoco", rule=f"has no readings on a device: observe({name!r})", choices=("mujoco_warp",)
+        )
 
     def fail(self, failed: np.ndarray) -> None:
         """Mark environments (B,) as failed."""

@@ -10,12 +10,16 @@ import numpy as np
 import warp as wp
 
 from raytac.errors import InputError, OverlapError
+from raytac.gel.surface import PadGrid
+from raytac.markers.base import MarkersConfig
 from raytac.se3 import inverse, pose_of
 from raytac.world.c_states import put_to_start, state_numbers
 from raytac.world.engine.choice import WarpEngine
 from raytac.world.environment_models import Variation
 from raytac.world.pad_contact import PadIndices
+from raytac.world.pad_touch import PadTouch
 from raytac.world.rigid_readings import RigidReadings
+from raytac.world.warp_frame import WarpFrame
 from raytac.world.warp_world import WarpWorld
 from raytac.world.world_model import WorldModel
 from raytac.world.world_state import constant_controls
@@ -24,11 +28,20 @@ from raytac.world.world_state import constant_controls
 class WarpStates:
     """B environments on MuJoCo Warp, with the members of ``CStates``; ``world`` is the part on the device."""
 
-    def __init__(self, composed: WorldModel, num_envs: int, engine: WarpEngine, device: str) -> None:
-        """States at the start.
+    def __init__(
+        self,
+        composed: WorldModel,
+        num_envs: int,
+        engine: WarpEngine,
+        device: str,
+        *,
+        grids: Mapping[str, PadGrid],
+        markers: MarkersConfig | None,
+    ) -> None:
+        """States at the start; ``grids``: of the sensors whose heights, and ``markers``, ``read`` gives.
 
         Raises:
-            InputError: a keyframe with speeds, activations or mocap bodies; as ``WarpWorld``.
+            InputError: a keyframe with speeds, activations or mocap bodies; as ``WarpWorld`` and ``PadTouch``.
             BackendError: MuJoCo Warp is not installed, or ``device`` does not work.
         """
         model, key = composed.model, composed.key
@@ -48,6 +61,15 @@ class WarpStates:
         self.pads = RigidReadings(composed, self.world.contact, self.world.pairs, self.world.engine)
         self._reader = self.world.engine.reader(state_numbers(composed))
         self._indices, self._scratch = PadIndices.of(composed), mujoco.MjData(model)
+        place, bodies = self.world.engine.device, [body.parts for body in composed.touched]
+        self._names = [mounted.name for mounted in composed.sensors]
+        self._touches = {
+            one.name: PadTouch(one.spec, grids[one.name], bodies, markers, pad=k, num_envs=num_envs, device=str(place))
+            for k, one in enumerate(composed.sensors)
+            if one.name in grids
+        }
+        self._touch = self.world.engine.capture(self._launch_touches)
+        self._forget(wp.full(num_envs, value=True, dtype=wp.bool, device=place))
 
     @property
     def data(self) -> Any:
@@ -79,6 +101,25 @@ class WarpStates:
         if (failed & ~self.failed).any():
             self.world.engine.active.assign(~(failed | self.failed))
 
+    def read(self, name: str) -> WarpFrame:
+        """Readings of a sensor on the device; nothing is copied or launched."""
+        wrench: Any = self.world.contact.wrenches[:, self._names.index(name)]
+        active, touch = self.world.engine.active, self._touches.get(name)
+        if touch is None:
+            return WarpFrame(wrench, active)
+        markers = None if touch.fots is None else touch.fots.displacement
+        return WarpFrame(wrench, active, touch.height, touch.contact, markers)
+
+    def _launch_touches(self) -> None:
+        for touch in self._touches.values():
+            touch.launch(self.world.contact, self.world.engine.active)
+
+    def _forget(self, mask: wp.array) -> None:
+        """Forget the past of the pads of a mask (B,), and show the present."""
+        for touch in self._touches.values():
+            touch.reset(mask)
+        self._touch()
+
     def step(self, control: Any) -> None:
         """One control step by constant controls, or None, which holds.
 
@@ -99,7 +140,10 @@ class WarpStates:
         else:
             rule = "must be constant in a step on engine='mujoco_warp', which asks nothing of the host"
             raise InputError("control", value=type(control).__name__, rule=rule, choices=("None", "NumPy array", "Warp array"))
+        self._touch()
         self.world.check()
+        for touch in self._touches.values():
+            touch.check()
 
     def reset(
         self, envs: Sequence[int], joints: np.ndarray | None, bodies: Mapping[str, np.ndarray], variation: Variation | None
@@ -123,6 +167,7 @@ class WarpStates:
         mask[list(envs)] = True
         self.world.check()
         self.world.reset(qpos, mask)
+        self._forget(wp.array(mask, dtype=wp.bool, device=self.world.engine.device))
         self.pads.surfaces.reset(np.asarray(envs, int))
 
     def _checked_positions(self, envs: Sequence[int], joints: np.ndarray | None, bodies: Mapping[str, np.ndarray]) -> np.ndarray:

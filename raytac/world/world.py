@@ -16,6 +16,7 @@ from raytac.checks import MOST_ENVIRONMENTS, check_known, check_numbers, check_w
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.gel.surface import chosen_envs
+from raytac.markers.registry import markers_config
 from raytac.physics.base import PhysicsConfig
 from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
 from raytac.robots.arm import Arm
@@ -29,6 +30,7 @@ from raytac.world.engine.choice import WarpEngine, checked_engine
 from raytac.world.environment_models import Variation
 from raytac.world.pads import WORLD_PADS
 from raytac.world.sensor_frames import SensorFrames
+from raytac.world.start_check import check_start
 from raytac.world.world_model import WorldModel, compiled_model, own_world_model
 from raytac.world.world_state import Control, WorldState
 
@@ -38,9 +40,7 @@ if TYPE_CHECKING:
     from raytac.physics.soft.scene import SoftScene
     from raytac.robots.mount import SensorChoice
     from raytac.world.touched import TouchChoice
-
-_OVERLAP = 1e-4
-"""Greatest overlap of rigid bodies at the start [m]: rounding of a scene's lengths."""
+    from raytac.world.warp_frame import WarpFrame
 
 _BEYOND = 1e-2
 """Greatest excess of joints over their range at the start [rad or m].
@@ -185,13 +185,18 @@ class TactileWorld:
         if isinstance(self.engine, WarpEngine):
             from raytac.world.warp_states import WarpStates
 
-            self._states: CStates | WarpStates = WarpStates(self.composed, num_envs, self.engine, device)
+            felt = "height" in self._frames.outputs or markers is not None
+            grids = {one: sensor.grid for one, sensor in self._frames.sensors.items()} if felt else {}
+            model = None if markers is None else markers_config(markers)
+            self._states: CStates | WarpStates = WarpStates(
+                self.composed, num_envs, self.engine, device, grids=grids, markers=model
+            )
         else:
             pads = partial(WORLD_PADS.config_class(name), physics=self.physics, coupling=self.coupling, device=device)
             self._states = CStates(self.composed, num_envs, pads)
         self.models, self._pads = self._states.models, self._states.pads
         self._stepped = Lock()
-        self._check_start()
+        check_start(self.composed, self._states.first(), self._pads.overlap(0))
 
     def __repr__(self) -> str:
         name, sensors = "own model" if self.scene is None else repr(self.scene.name), ", ".join(self.sensor_names)
@@ -359,6 +364,18 @@ class TactileWorld:
         finally:
             self._states.fail(failed)
 
+    def read(self, name: str) -> WarpFrame:
+        """Readings of one sensor after the last step or reset, with MuJoCo Warp: arrays on the device.
+
+        Nothing is copied. The height is there if ``outputs`` or markers ask for it. Another gel that presses is not in it, as it is in
+        the frames of ``observe``.
+
+        Raises ``InputError`` for an unknown sensor, or with C MuJoCo.
+        """
+        if name not in self.sensor_names:
+            raise InputError("sensor", value=name, rule="must be a sensor of the world", choices=self.sensor_names)
+        return self._states.read(name)
+
     def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Present surface of a body or soft pad: vertices (B, n, 3) [m], world, and faces (F, 3).
 
@@ -377,27 +394,3 @@ class TactileWorld:
         surface = object_surface(body.parts)
         poses = self.state().world_from_body[name]
         return np.einsum("bij,nj->bni", poses[:, :3, :3], surface.vertices) + poses[:, None, :3, 3], surface.faces
-
-    def _size_if_large(self, name: str) -> str:
-        """End of a message: the diameter of a body's largest geom, if it is beyond 1 m."""
-        geoms = list(self.composed.bodies[name].geoms)
-        size = 2.0 * float(self.model.geom_rbound[geoms].max(initial=0.0))
-        return f"; it is {size:.3g} m large: are its units metres?" if size > 1.0 else ""
-
-    def _check_start(self) -> None:
-        """Raise ``InputError`` for a start in which bodies overlap.
-
-        A user's own model may start in contact, but not through a pad.
-        """
-        data, model = self._states.first(), self.model
-        for contact in data.contact[: data.ncon]:
-            if contact.dist < -_OVERLAP and self.scene is not None:
-                names = [model.body(int(model.geom_bodyid[g])).name or "world" for g in contact.geom]
-                rule = f"overlap by {-contact.dist * 1e3:.3g} mm at the start: move one of them in the scene"
-                raise InputError("bodies", value=tuple(names), rule=rule)
-        for sensor, body, depth in self._pads.overlap(0):
-            if depth > (_OVERLAP if self.scene is not None else np.inf) or np.isinf(depth):
-                rule = f"must not be pressed into the pad of {sensor!r} at the start; it is, by {depth * 1e3:.3g} mm"
-                if np.isinf(depth):
-                    rule = f"must not start beyond the face that the gel of {sensor!r} is bonded to{self._size_if_large(body)}"
-                raise InputError("body", value=body, rule=rule)

@@ -35,7 +35,7 @@ def world(
 ) -> TactileWorld:
     """A ball above a pad that looks upwards."""
     spec = mujoco.MjSpec.from_string(FREE.format(z=z, tilt=9.81 * tilt, timestep=timestep))
-    mount(spec, "gelsight_mini", site="pad", name="left", pose=np.eye(4))
+    mount(spec, "gelsight_mini_7x9", site="pad", name="left", pose=np.eye(4))
     settings = {"outputs": ("wrench", "height"), "pitch": 0.4e-3, "control_timestep": 0.01, "device": "cpu", **settings}
     return TactileWorld(spec, touches={"ball": 0.8}, num_envs=num_envs, engine=engine, **settings)
 
@@ -162,3 +162,42 @@ def test_contacts_that_do_not_fit_are_an_error_that_names_the_number_to_set() ->
         for _ in range(5):
             ours.step()
     assert ours.failed.all()
+
+
+def test_readings_on_the_device_share_its_memory_and_are_what_the_host_observes() -> None:
+    ours = world("mujoco_warp", z=0.11, markers="fots_published", pitch=0.8e-3)
+    frame = ours.read("left")
+    rest = frame.numpy()
+    for _ in range(8):
+        ours.step()
+        host = ours.observe()["left"]
+    now = ours.read("left").numpy()
+    assert set(now) == {"wrench", "active", "height", "contact", "markers"} and now["active"].all()
+    np.testing.assert_array_equal(frame.numpy()["wrench"], now["wrench"])
+    assert (
+        now["wrench"][0, 2] < -0.3 and not rest["wrench"].any() and now["contact"].any() and np.abs(now["markers"]).max() > 1e-6
+    )
+    np.testing.assert_array_equal(now["wrench"], ours.state().wrench["left"])
+    np.testing.assert_allclose(now["height"], host.height, atol=2e-6)
+    ours.reset([1])
+    after = ours.read("left").numpy()
+    assert not after["wrench"][1].any() and not np.array_equal(after["markers"][1], now["markers"][1])
+    for name, values in now.items():
+        np.testing.assert_array_equal(after[name][0], values[0])
+    torch = pytest.importorskip("torch")
+    tensors = frame.torch()
+    assert {tensors[name].data_ptr() for name in ("active", "height", "markers")} == {
+        int(array.ptr or 0) for array in (frame.active, frame.height, frame.markers) if array is not None
+    }
+    before = tensors["height"].clone()
+    ours.reset()
+    assert not torch.equal(tensors["height"], before)
+
+
+def test_readings_on_a_device_need_mujoco_warp_and_what_it_has() -> None:
+    with pytest.raises(InputError, match="mujoco_warp"):
+        world("mujoco").read("left")
+    ours = world("mujoco_warp", outputs=("wrench",))
+    assert set(ours.read("left").numpy()) == {"wrench", "active"}
+    with pytest.raises(InputError, match=r"sensor = 'right'.*left"):
+        ours.read("right")
