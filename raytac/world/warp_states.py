@@ -68,7 +68,8 @@ class WarpStates:
             for k, one in enumerate(composed.sensors)
             if one.name in grids
         }
-        self._touch = self.world.engine.capture(self._launch_touches)
+        launch = self._launch_touches
+        self._touch = self.world.engine.capture(launch) if self._touches else launch
         self._forget(wp.full(num_envs, value=True, dtype=wp.bool, device=place))
 
     @property

@@ -190,7 +190,11 @@ def test_readings_on_the_device_share_its_memory_and_are_what_the_host_observes(
         int(array.ptr or 0) for array in (frame.active, frame.height, frame.markers) if array is not None
     }
     before = tensors["height"].clone()
+    ours.step()
+    np.testing.assert_array_equal(tensors["wrench"].numpy(), ours.state().wrench["left"])
+    assert tensors["wrench"][0, 2] < -0.3
     ours.reset()
+    assert not tensors["wrench"].any()
     assert not torch.equal(tensors["height"], before)
 
 
