@@ -24,18 +24,15 @@ from typing import Any
 
 import numpy as np
 
-from raytac.errors import InputError, OverlapError
-from raytac.gel.surface import PadGrid
-from raytac.physics.base import PadReading
+from raytac.errors import InputError
 from raytac.physics.rigid.gel_contact import GelContact, HostViews
-from raytac.se3 import inverse
 from raytac.warp_runtime import Recorded
 from raytac.world.engine.base import Engine
 from raytac.world.engine.c_mujoco import CMujoco
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.gel_pairs import GelPairs
 from raytac.world.pad_contact import PadIndices, gel_contact
-from raytac.world.pad_surfaces import PadSurfaces
+from raytac.world.rigid_readings import RigidReadings
 from raytac.world.world_model import WorldModel
 from raytac.world.world_state import Drive
 
@@ -54,11 +51,8 @@ def pads_on_c_mujoco(composed: WorldModel, models: EnvironmentModels, datas: Seq
     return RigidPads(composed, contact, pairs, engine), engine
 
 
-class RigidPads:
+class RigidPads(RigidReadings):
     """All pads of a world in B environments, on an engine: the order of a step."""
-
-    soft = None
-    meshes: tuple[str, ...] = ()
 
     def __init__(self, composed: WorldModel, contact: GelContact, pairs: GelPairs, engine: Engine) -> None:
         """Pads of ``composed``; ``contact``: of their gels; ``pairs``: gels that may touch.
@@ -69,34 +63,25 @@ class RigidPads:
             raise InputError(
                 "engine", value=type(engine).__name__, rule="must divide steps: others have the order of a step themselves"
             )
-        self.composed, self.contact, self.engine, self._pairs = composed, contact, engine, pairs
-        self.bodies = composed.touched
-        self._names = [mounted.name for mounted in composed.sensors]
-        gels, shapes = [spec.gelpad for spec in composed.sensor_specs], [body.parts for body in self.bodies]
+        super().__init__(composed, contact, pairs, engine)
         self._views = HostViews(contact)
         self._begin = [Recorded(engine.read_frames, partial(contact.begin, whole=whole)) for whole in (False, True)]
         self._move = Recorded(engine.read_frames, contact.move)
         self._end = Recorded(engine.read_rows, contact.end)
-        num_envs = len(contact.wrenches)
-        self._surfaces = PadSurfaces(dict(zip(self._names, gels, strict=True)), shapes, num_envs)
-        self.report: dict[str, np.ndarray] = {}
 
     def reset(self, envs: Sequence[int], bodies: Mapping[str, np.ndarray] | None = None) -> None:
         """Forget what environments went through; where bodies start, the engine knows.
 
         Raises ``OverlapError``: a body starts beyond a pad's bonded face.
         """
-        pierced = self.contact.faces.pierced(self._pad_from_body()[np.asarray(envs, int)])
-        for row, pad, i in np.argwhere(pierced).tolist():
-            rule = f"{self.bodies[i].name!r} starts beyond the face that the gel of {self._names[pad]!r} is bonded to"
-            raise OverlapError(f"environment {envs[row]}: {rule}")
+        self.check_beyond(envs, self._pad_from_body()[np.asarray(envs, int)])
         self.clear(envs)
 
     def clear(self, envs: Sequence[int]) -> None:
         """Forget what environments went through."""
         self.contact.vary()
         self.contact.clear(envs)
-        self._surfaces.reset(np.asarray(envs, int))
+        self.surfaces.reset(np.asarray(envs, int))
 
     def advance(self, drive: Drive, failed: np.ndarray) -> None:
         """One control step of all environments; failures are marked in ``failed`` (B,).
@@ -161,37 +146,3 @@ class RigidPads:
         lost = self._views.lost[: len(envs)]
         if np.count_nonzero(lost):
             failed[envs[lost != 0]] = True
-
-    def wrench(self, name: str) -> np.ndarray:
-        """Wrench (B, 6) on a pad about its origin, pad frame, in the last step."""
-        return self._views.wrench[:, self._names.index(name)].copy()
-
-    def overlap(self, env: int) -> list[tuple[str, str, float]]:
-        """Sensor, body and depth [m] of every overlap; inf beyond a pad's bonded face."""
-        poses = self._pad_from_body()[[env]]
-        contacts = self.contact.search.contacts(poses, np.zeros(1, int), 0.0)
-        depth = np.zeros(poses.shape[1:3])
-        depth[contacts.pad, contacts.body] = contacts.depth
-        depth[self.contact.faces.pierced(poses)[0]] = np.inf
-        return [(self._names[k], self.bodies[i].name, float(depth[k, i])) for k, i in np.argwhere(depth > 0.0).tolist()]
-
-    def reading(self, name: str, grid: PadGrid, failed: np.ndarray, envs: Sequence[int] | None = None) -> PadReading:
-        """Surface and forces of one sensor on ``grid``, a row for each of ``envs`` (None: all)."""
-        rows, index = np.arange(len(failed)) if envs is None else np.asarray(envs), self._names.index(name)
-        pads, bodies = self.engine.read_poses()
-        world_from_pad, failed = pads[rows], failed[rows]
-        return self._surfaces.reading(
-            name,
-            grid,
-            inverse(world_from_pad[:, index])[:, None] @ bodies[rows],
-            self.wrench(name)[rows],
-            failed,
-            rows,
-            press=lambda height: self._pairs.press(index, height, grid, world_from_pad, failed),
-            shear=lambda pressed: self.contact.shear.of(rows, index, pressed),
-        )
-
-    def _pad_from_body(self) -> np.ndarray:
-        """Present poses (B, pads, bodies, 4, 4) of bodies."""
-        pads, bodies = self.engine.read_poses()
-        return inverse(pads)[:, :, None] @ bodies[:, None]

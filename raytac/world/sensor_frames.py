@@ -35,6 +35,12 @@ class SensorFrames:
                 TactileSensor(one.spec, **{"seed": seed, "num_envs": num_envs, **settings, "device": "cpu"})
 
     @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of what every sensor was asked for."""
+        asked = self._settings["outputs"]
+        return (asked,) if isinstance(asked, str) else tuple(asked)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the sensors, without making them."""
         return tuple(mounted.name for mounted in self._mounted)

@@ -6,6 +6,7 @@ Thousands of environments run on one GPU.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import warp as wp
 from raytac.checks import MOST_ENVIRONMENTS, check_number, check_numbers, check_whole
 from raytac.device import resolve_device
 from raytac.errors import InputError
+from raytac.robots.arm import Arm
 from raytac.robots.arm_kernels import Springs, joint_springs, servo_step
 from raytac.robots.ik import PoseServo
 from raytac.robots.panda import MAX_VELOCITY
@@ -28,12 +30,13 @@ from raytac.world.environment_models import EnvironmentModels
 from raytac.world.gel_pairs import GelPairs
 from raytac.world.pad_contact import PadIndices, gel_contact
 from raytac.world.start_kernels import aim_at_positions, place_body, set_columns
+from raytac.world.world_model import WorldModel
 
 _SPRINGS = ("joints", "speed", "bias", "mass")
 
 
 class WarpWorld:
-    """B environments of a task scene, whose arms follow targets by springs in their joints.
+    """B environments of a model with rigid pads; arms with torque motors follow targets by springs.
 
     The springs obey the law of ``JointImpedance``.
 
@@ -52,7 +55,7 @@ class WarpWorld:
 
     def __init__(
         self,
-        scene: str | Path | TaskScene,
+        scene: str | Path | TaskScene | WorldModel,
         *,
         num_envs: int = 1,
         device: str = "auto",
@@ -64,7 +67,8 @@ class WarpWorld:
         """Compose the scene and put all environments to its start.
 
         Args:
-            scene: name of a shipped task scene, path of a scene file, or a scene.
+            scene: name of a shipped task scene, path of a scene file, a scene, or a composed model, which may do without an arm: it
+                follows no targets then.
             device: "auto", "cpu" or "cuda".
             frequency: of the springs in the joints [rad/s].
             launches: steps of MuJoCo in a control step, as many as the scene's if None. Of more a world divides one in which something
@@ -72,38 +76,32 @@ class WarpWorld:
             contacts, rows: memory for contacts and constraint rows, an environment each; None is a guess.
 
         Raises:
-            InputError: a value out of its range, a scene without an arm that has torque motors, or one that MuJoCo Warp refuses.
+            InputError: a value out of its range, a scene without an arm that has torque motors, or a model that MuJoCo Warp refuses.
             BackendError: MuJoCo Warp is not installed.
         """
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
         check_number("frequency", frequency, "[0, inf)", "rad/s")
-        self.composed = composed = compose(scene if isinstance(scene, TaskScene) else load_task(scene), "rigid")
-        arm, name = composed.arm, resolve_device(device, ray_tracing=False)
-        if arm is None or arm.motors is None:
-            raise InputError("scene", value=str(scene), rule="needs an arm with torque motors")
+        if not isinstance(scene, WorldModel):
+            given, scene = scene, compose(scene if isinstance(scene, TaskScene) else load_task(scene), "rigid")
+            if scene.arm is None or scene.arm.motors is None:
+                raise InputError("scene", value=str(given), rule="needs an arm with torque motors")
+        self.composed, name = scene, resolve_device(device, ray_tracing=False)
+        composed = scene
         self._steps = round(composed.control_timestep / composed.timestep)
         self._launches = self._steps if launches is None else check_whole("launches", launches, self._steps)
         pads, self.models = PadIndices.of(composed), EnvironmentModels(composed, num_envs)
-        pairs = GelPairs([spec.gelpad for spec in composed.sensor_specs], pads.carriers, num_envs, device=name).pairs
-        self.contact = gel_contact(composed, self.models, pairs, num_envs=num_envs, device=name)
+        self.pairs = GelPairs([spec.gelpad for spec in composed.sensor_specs], pads.carriers, num_envs, device=name)
+        self.contact = gel_contact(composed, self.models, self.pairs.pairs, num_envs=num_envs, device=name)
         self.engine = MujocoWarp(self.contact, pads, self.models, contacts=contacts, rows=rows)
-        known = arm.numbers()
-        known["tool"] = known["site"]
-        known |= {"fingers": numbers("qpos", composed.fingers), "pads": site_pose(pads.sites), "bodies": body_pose(pads.bodies)}
+        arm = composed.arm
+        known = {} if arm is None else arm.numbers()
+        if arm is not None:
+            known["tool"] = known["site"]
+        known |= {"time": numbers("time", np.array(0)), "fingers": numbers("qpos", composed.fingers)}
+        known |= {"pads": site_pose(pads.sites), "bodies": body_pose(pads.bodies)}
         self._reader = self.engine.reader(known)
         self.state = self._reader.arrays
-        posture = composed.start[arm.qpos]
-        self._servo: Any = PoseServo(arm, max_velocity=np.array(MAX_VELOCITY), posture=posture).struct(self.state)
-        self._servo.duration.fill_(composed.control_timestep)
-        springs: Any = Springs()
-        for key in _SPRINGS:
-            setattr(springs, key, self.state[key])
         with wp.ScopedDevice(self.engine.device):
-            springs.target, springs.target_speed = self._servo.step, self._servo.velocity
-            springs.torque = wp.zeros((num_envs, len(arm)), dtype=wp.float64)
-            springs.start = wp.zeros(num_envs, dtype=wp.float64)
-            springs.time = self.engine.elapsed
-            self._motors, self._joints = (wp.array(index, dtype=wp.int32) for index in (arm.motors, arm.qpos))
             self._all = wp.full(num_envs, value=True, dtype=wp.bool)
             self._start = wp.array(np.repeat(composed.start[None], num_envs, axis=0), dtype=wp.float32)
             self._placed = wp.clone(self._start)
@@ -113,10 +111,29 @@ class WarpWorld:
                 self._gap = wp.array(composed.ctrl[[composed.opening]], dtype=wp.float64)
                 self._gripper = wp.array([composed.opening], dtype=wp.int32)
                 self._opening = wp.zeros((num_envs, 1), dtype=wp.float64)
+        self._springs: Any = None
+        if arm is not None and arm.motors is not None:
+            self._make_springs(arm, arm.motors, frequency)
+        self._graphs: dict[bool, Callable[[], None]] = {}
+        self.reset()
+
+    def _make_springs(self, arm: Arm, motors: np.ndarray, frequency: float) -> None:
+        """Springs in an arm's joints, and the inverse kinematics that moves their targets."""
+        composed, count = self.composed, self.engine.num_envs
+        posture = composed.start[arm.qpos]
+        self._servo: Any = PoseServo(arm, max_velocity=np.array(MAX_VELOCITY), posture=posture).struct(self.state)
+        self._servo.duration.fill_(composed.control_timestep)
+        springs: Any = Springs()
+        for key in _SPRINGS:
+            setattr(springs, key, self.state[key])
+        with wp.ScopedDevice(self.engine.device):
+            springs.target, springs.target_speed = self._servo.step, self._servo.velocity
+            springs.torque = wp.zeros((count, len(arm)), dtype=wp.float64)
+            springs.start = wp.zeros(count, dtype=wp.float64)
+            springs.time = self.engine.elapsed
+            self._motors, self._joints = (wp.array(index, dtype=wp.int32) for index in (motors, arm.qpos))
         springs.stiffness, springs.damping = frequency**2, 2.0 * frequency
         self._springs = springs
-        self._graph: Callable[[], None] | None = None
-        self.reset()
 
     @property
     def target(self) -> wp.array:
@@ -185,34 +202,57 @@ class WarpWorld:
             self._launch(place_body, count, [poses, composed.bodies[name].qpos, positions])
         self.engine.reset(chosen, positions, self._ctrl)
         self.contact.clear_active(chosen)
-        self._launch(aim_at_positions, self.target.shape, [chosen, self._joints, positions, self.target, self.target_speed])
+        if self._springs is not None:
+            self._launch(aim_at_positions, self.target.shape, [chosen, self._joints, positions, self.target, self.target_speed])
         if self.opening is not None:
             self._launch(set_columns, self.opening.shape, [chosen, self._gap, self.opening])
         self.engine.finish()
         self._reader.read()
 
-    def step(self) -> None:
-        """One control step of active environments towards ``target``, at ``target_speed``."""
-        if self._graph is None:
-            self._graph = self.engine.capture(self.launch)  # which runs once
+    def step(self, controls: wp.array | None = None) -> None:
+        """One control step of active environments towards ``target``, at ``target_speed``.
+
+        With ``controls`` (B, nu), float32, on the device the actuators have these instead.
+        """
+        held = controls is None
+        if controls is not None:
+            wp.copy(self.engine.data.ctrl, controls)
+        if held in self._graphs:
+            self._graphs[held]()
         else:
-            self._graph()
+            self._graphs[held] = self.engine.capture(partial(self.launch, held=held))  # which runs once
+
+    def hold(self) -> None:
+        """One control step in which everything is held at the start, as ``TactileWorld.hold`` does."""
+        if self._springs is None:
+            return self.step(self._ctrl if self.composed.scene is not None else self.engine.data.ctrl)
+        wp.copy(self.engine.data.ctrl, self._ctrl)
+        everywhere = [self._all, self._joints, self._start, self.target, self.target_speed]
+        self._launch(aim_at_positions, self.target.shape, everywhere)
+        if self.opening is not None:
+            self._launch(set_columns, self.opening.shape, [self._all, self._gap, self.opening])
+        self.step()
 
     def aim(self) -> None:
         """Launch the inverse kinematics (``PoseServo``): from the tool's targets to the joints'."""
         self._launch(servo_step, self.engine.num_envs, [self._servo])
 
-    def launch(self) -> None:
-        """Launch a control step, as ``step`` records it: for a graph that does more."""
-        self.engine.advance(self.drive, scene_steps=self._steps, launches=self._launches)
+    def launch(self, *, held: bool = True) -> None:
+        """Launch a control step, as ``step`` records it: for a graph that does more.
+
+        ``held``: by springs, not by constant controls.
+        """
+        drive = self.drive if held else _leave
+        self.engine.advance(drive, scene_steps=self._steps, launches=self._launches)
         self.engine.finish()
         self._reader.read()
 
     def drive(self) -> None:
         """Torques of the springs in the joints, and the gripper's command."""
-        self._reader.read()
-        self._launch(joint_springs, self.target.shape, [self._springs])
-        self.engine.write_controls(self._motors, self._springs.torque)
+        if self._springs is not None:
+            self._reader.read()
+            self._launch(joint_springs, self.target.shape, [self._springs])
+            self.engine.write_controls(self._motors, self._springs.torque)
         if self.opening is not None:
             self.engine.write_controls(self._gripper, self.opening)
 
@@ -229,3 +269,7 @@ class WarpWorld:
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.engine.device)
+
+
+def _leave() -> None:
+    """Drive nothing: controls stay as they are."""

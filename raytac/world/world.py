@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
+from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -12,24 +13,26 @@ import mujoco
 import numpy as np
 
 from raytac.checks import MOST_ENVIRONMENTS, check_known, check_numbers, check_whole
-from raytac.errors import InputError, OverlapError
+from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.gel.surface import chosen_envs
+from raytac.markers.registry import markers_config
 from raytac.physics.base import PhysicsConfig
 from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
 from raytac.robots.arm import Arm
-from raytac.robots.impedance import JointImpedance
-from raytac.robots.states import Numbers, StateReader, body_pose, numbers, site_pose
-from raytac.se3 import quaternion, rigid_poses
+from raytac.se3 import rigid_poses
 from raytac.sensor import TactileSensor
 from raytac.specs.task import COUPLINGS, TaskScene
 from raytac.specs.task_file import load_task
+from raytac.world.c_states import CStates
 from raytac.world.compose import compose
-from raytac.world.environment_models import EnvironmentModels, Variation
-from raytac.world.pads import WORLD_PADS, WorldPads
+from raytac.world.engine.choice import WarpEngine, checked_engine
+from raytac.world.environment_models import Variation
+from raytac.world.pads import WORLD_PADS
 from raytac.world.sensor_frames import SensorFrames
+from raytac.world.start_check import check_start
 from raytac.world.world_model import WorldModel, compiled_model, own_world_model
-from raytac.world.world_state import BatchController, Control, Drive, WorldState, check_controls
+from raytac.world.world_state import Control, WorldState
 
 if TYPE_CHECKING:
     from raytac.markers import MarkersConfig
@@ -37,9 +40,7 @@ if TYPE_CHECKING:
     from raytac.physics.soft.scene import SoftScene
     from raytac.robots.mount import SensorChoice
     from raytac.world.touched import TouchChoice
-
-_OVERLAP = 1e-4
-"""Greatest overlap of rigid bodies at the start [m]: rounding of a scene's lengths."""
+    from raytac.world.warp_frame import WarpFrame
 
 _BEYOND = 1e-2
 """Greatest excess of joints over their range at the start [rad or m].
@@ -67,6 +68,7 @@ class TactileWorld:
         scene: the task scene; None of a model of one's own.
         physics: configuration that is used.
         model: MuJoCo's model of the scene.
+        engine: settings of MuJoCo Warp; None is C MuJoCo.
         models: the model of every environment: the scene's own, or another one after a ``reset`` with a variation.
         arm: the joints that move the robot's site; None without joints.
         composed: names and indices of the scene's parts in the model.
@@ -88,6 +90,7 @@ class TactileWorld:
         optics: str | OpticsConfig[Any] = "raytrace",
         resolution: tuple[int, int] | str | None = None,
         num_envs: int = 1,
+        engine: str | WarpEngine = "mujoco",
         device: str = "auto",
         seed: int = 0,
         pitch: float | None = None,
@@ -110,6 +113,8 @@ class TactileWorld:
             coupling: ``two_way`` or ``one_way``; None is as the scene says. A rigid pad acts both ways always.
             outputs, markers, optics, resolution, device: of every sensor, as ``TactileSensor`` takes them.
             num_envs: number of environments B.
+            engine: ``mujoco``, or ``mujoco_warp`` with all states and contacts on ``device``, for rigid pads; a ``WarpEngine`` has the
+                sizes of its memory.
             seed: of every random number.
             pitch: spacing of the pads' grids [m], as of ``TactileSensor``.
 
@@ -122,6 +127,7 @@ class TactileWorld:
         """
         asked = checked_physics(physics)
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
+        self.engine = checked_engine(engine)
         if coupling is not None:
             check_known("coupling", coupling, COUPLINGS)
         own = {"sensors": sensors, "touches": touches, "control_timestep": control_timestep, "keyframe": keyframe}
@@ -146,6 +152,8 @@ class TactileWorld:
         if is_own and self.physics.is_simulated:
             rule = "needs a task scene: bodies of a model of one's own meet rigid pads"
             raise InputError("physics", value=name, rule=rule, choices=("rigid",))
+        if isinstance(self.engine, WarpEngine) and self.physics.is_simulated:
+            raise InputError("physics", value=name, rule="needs engine='mujoco': MuJoCo Warp has rigid pads", choices=("rigid",))
         if coupling == "one_way" and not self.physics.is_simulated:
             raise InputError(
                 "coupling", value=coupling, rule="is for soft pads: a rigid pad acts both ways", choices=("two_way",)
@@ -173,24 +181,22 @@ class TactileWorld:
             pitch=pitch,
         )
         self.model = self.composed.model
-        self._data = tuple(mujoco.MjData(self.model) for _ in range(num_envs))
-        self.models = EnvironmentModels(self.composed, num_envs)
         self.arm: Arm | None = self.composed.arm
-        self._reader = StateReader(self.data, self._numbers())
-        self._law, self._holding = None, None
-        if self.scene is not None and self.arm is not None and self.arm.motors is not None:
-            self._law = JointImpedance(self.arm)
-            others = np.setdiff1d(np.arange(self.model.nu), self.arm.motors)
-            self._holding = self._law.springs(self.data, others.tolist())
-            self._holding.aim(self.composed.start[self.arm.qpos], np.zeros(1), np.zeros(1), self.composed.ctrl[others])
-        self._spares: list[mujoco.MjData] = []
-        """States in which a reset keeps those that it may have to put back."""
-        self._failed, self._stepped = np.zeros(num_envs, bool), Lock()
-        self._start_over(range(num_envs))
-        self._pads: WorldPads = WORLD_PADS.config_class(name)(
-            self.composed, self.models, self.data, physics=self.physics, coupling=self.coupling, device=device
-        )
-        self._check_start()
+        if isinstance(self.engine, WarpEngine):
+            from raytac.world.warp_states import WarpStates
+
+            felt = "height" in self._frames.outputs or markers is not None
+            grids = {one: sensor.grid for one, sensor in self._frames.sensors.items()} if felt else {}
+            model = None if markers is None else markers_config(markers)
+            self._states: CStates | WarpStates = WarpStates(
+                self.composed, num_envs, self.engine, device, grids=grids, markers=model
+            )
+        else:
+            pads = partial(WORLD_PADS.config_class(name), physics=self.physics, coupling=self.coupling, device=device)
+            self._states = CStates(self.composed, num_envs, pads)
+        self.models, self._pads = self._states.models, self._states.pads
+        self._stepped = Lock()
+        check_start(self.composed, self._states.first(), self._pads.overlap(0))
 
     def __repr__(self) -> str:
         name, sensors = "own model" if self.scene is None else repr(self.scene.name), ", ".join(self.sensor_names)
@@ -212,8 +218,8 @@ class TactileWorld:
 
     @property
     def data(self) -> tuple[mujoco.MjData, ...]:
-        """MuJoCo's state in every environment."""
-        return self._data
+        """MuJoCo's state in every environment; raises ``InputError`` with MuJoCo Warp, whose states lie on a device."""
+        return self._states.data
 
     @property
     def sensors(self) -> dict[str, TactileSensor]:
@@ -272,35 +278,9 @@ class TactileWorld:
             self._check_joints(joints, chosen)
         if variation is not None:
             self.models.check(variation, len(chosen), rigid=not self.physics.is_simulated)
-        if joints is None and not starts and variation is None and not self.models.differ(chosen):
-            self._start_over(chosen)
-            self._pads.reset(chosen)
-        else:
-            self._start_elsewhere(chosen, joints, starts, variation)
+        self._states.reset(chosen, joints, starts, variation)
         self._frames.reset(chosen)
         return self.state()
-
-    def _start_elsewhere(
-        self, envs: Sequence[int], joints: np.ndarray | None, bodies: Mapping[str, np.ndarray], variation: Variation | None
-    ) -> None:
-        """Reset to given starts or models; nothing changes if bodies overlap there."""
-        failed, models = self._failed.copy(), self.models.snapshot()
-        # A state takes longer to make than to copy.
-        self._spares += [mujoco.MjData(self.model) for _ in range(len(envs) - len(self._spares))]
-        before = self._spares[: len(envs)]
-        for b, spare in zip(envs, before, strict=True):
-            mujoco.mj_copyData(spare, self.model, self.data[b])
-        if variation is not None:
-            self.models.vary(envs, variation)
-        self._start_over(envs, joints, bodies)
-        try:
-            self._pads.reset(envs, bodies)
-        except OverlapError:
-            self.models.restore(models)
-            for b, data in zip(envs, before, strict=True):
-                mujoco.mj_copyData(self.data[b], self.model, data)
-            self._failed[:] = failed
-            raise
 
     def _check_joints(self, joints: np.ndarray, envs: Sequence[int]) -> None:
         arm = self.arm
@@ -320,25 +300,6 @@ class TactileWorld:
             raise InputError(name, value=values[bad].tolist(), rule=f"must be finite; row {bad} is not")
         return values
 
-    def _start_over(
-        self, envs: Sequence[int] | range, joints: np.ndarray | None = None, bodies: Mapping[str, np.ndarray] | None = None
-    ) -> None:
-        """MuJoCo's part of a reset."""
-        for row, b in enumerate(envs):
-            data = self.data[b]
-            self.composed.reset(self.models[b], data)
-            if joints is not None and self.arm is not None:
-                data.qpos[self.arm.qpos] = joints[row]
-            for name, poses in (bodies or {}).items():
-                body = self.composed.bodies[name]
-                if body.is_free:
-                    data.qpos[body.qpos : body.qpos + 3] = poses[row, :3, 3]
-                    data.qpos[body.qpos + 3 : body.qpos + 7] = quaternion(poses[row, :3, :3])
-                else:  # the solver's own bodies are mirrored here again once it has reset them
-                    data.mocap_pos[body.mocap], data.mocap_quat[body.mocap] = poses[row, :3, 3], quaternion(poses[row, :3, :3])
-            mujoco.mj_forward(self.models[b], data)
-            self._failed[b] = False
-
     def step(self, control: Control | None = None) -> WorldState:
         """Advance every environment by the control timestep of the scene or the model.
 
@@ -351,12 +312,12 @@ class TactileWorld:
                 contact, in the only environment, which has failed then. Of several environments the one that moves so fast is marked in
                 ``failed``, with a ``RuntimeWarning``.
         """
-        drive = self._drive(self.hold if control is None else control)
+        held = control is None or (callable(control) and control == self.hold)
         if not self._stepped.acquire(blocking=False):
             rule = "must be stepped by one thread at a time; each thread may have a world of its own"
             raise InputError("world", value="stepped by another thread", rule=rule)
         try:
-            self._pads.advance(drive, self._failed)
+            self._states.step(None if held else control)
         finally:
             self._stepped.release()
         return self.state()
@@ -364,19 +325,15 @@ class TactileWorld:
     @property
     def failed(self) -> np.ndarray:
         """Environments whose physics broke down, (B,), bool."""
-        return self._failed.copy()
+        return self._states.failed.copy()
 
     def hold(self, data: mujoco.MjData, time: float) -> None:
         """Controller that keeps a scene's robot at its start, and another model's controls."""
-        if self.scene is None:
-            return
-        data.ctrl[:] = self.composed.ctrl
-        if self._law is not None and self.arm is not None:
-            self.arm.drive(data, self._law.torque(data, self.composed.start[self.arm.qpos]).torque)
+        self._states.hold(data)
 
     def state(self) -> WorldState:
         """Present state of all environments."""
-        now, lost = self._reader.values(), self._failed
+        now, lost = self._states.values(), self._states.failed
         wrench = {name: self._pads.wrench(name) for name in self.sensor_names}
         time = now.pop("time")
         if lost.any():
@@ -385,13 +342,6 @@ class TactileWorld:
         pads = {name: now[f"pad {name}"] for name in self.sensor_names}
         bodies = {name: now[f"body {name}"] for name in self.composed.bodies}
         return WorldState(time, now.get("joints"), pads, bodies, wrench, lost.copy(), dict(self._pads.report))
-
-    def _numbers(self) -> dict[str, Numbers]:
-        """Numbers that ``state`` reads of every environment."""
-        read = {"time": numbers("time", np.array(0))}
-        read |= {f"pad {m.name}": site_pose(int(self.model.site(m.site).id)) for m in self.composed.sensors}
-        read |= {f"body {name}": body_pose(body.index) for name, body in self.composed.bodies.items()}
-        return read if self.arm is None else read | {"joints": self.arm.numbers()["joints"]}
 
     def observe(
         self, sensors: Sequence[str] | str | None = None, envs: np.ndarray | list[int] | None = None
@@ -406,9 +356,25 @@ class TactileWorld:
 
         Raises ``InputError``: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
         """
-        return self._frames.observe(
-            lambda name, grid, rows: self._pads.reading(name, grid, self._failed, rows), self._failed, sensors, envs
-        )
+        failed = self._states.failed.copy()
+        try:
+            return self._frames.observe(
+                lambda name, grid, rows: self._pads.reading(name, grid, failed, rows), failed, sensors, envs
+            )
+        finally:
+            self._states.fail(failed)
+
+    def read(self, name: str) -> WarpFrame:
+        """Readings of one sensor after the last step or reset, with MuJoCo Warp: arrays on the device.
+
+        Nothing is copied. The height is there if ``outputs`` or markers ask for it. Another gel that presses is not in it, as it is in
+        the frames of ``observe``.
+
+        Raises ``InputError`` for an unknown sensor, or with C MuJoCo.
+        """
+        if name not in self.sensor_names:
+            raise InputError("sensor", value=name, rule="must be a sensor of the world", choices=self.sensor_names)
+        return self._states.read(name)
 
     def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Present surface of a body or soft pad: vertices (B, n, 3) [m], world, and faces (F, 3).
@@ -428,64 +394,3 @@ class TactileWorld:
         surface = object_surface(body.parts)
         poses = self.state().world_from_body[name]
         return np.einsum("bij,nj->bni", poses[:, :3, :3], surface.vertices) + poses[:, None, :3, 3], surface.faces
-
-    def _drive(self, control: Control) -> Drive:
-        """Function that writes the controls of environments, from any form of ``Control``."""
-        if isinstance(control, BatchController):
-            return lambda envs: control.drive(self.data, envs)
-        if isinstance(control, np.ndarray):
-            rows = self._constant_controls(control)
-
-            def write(envs: Sequence[int] | np.ndarray) -> None:
-                for b in envs:
-                    self.data[b].ctrl[:] = rows[b]
-
-            return write
-        if self._holding is not None and control == self.hold:
-            return self._holding.drive
-        each = [control] * self.num_envs if callable(control) else list(control)
-        if len(each) != self.num_envs:
-            raise InputError("control", value=len(each), rule=f"must be one controller, or one for each of {self.num_envs}")
-        for controller in each:
-            if not callable(controller):
-                raise InputError("control", value=controller, rule="must be a controller; constant controls are a NumPy array")
-
-        def call(envs: Sequence[int] | np.ndarray) -> None:
-            for b in envs:
-                each[b](self.data[b], float(self.data[b].time))
-                check_controls(b, self.data[b])
-
-        return call
-
-    def _constant_controls(self, control: np.ndarray) -> np.ndarray:
-        values = np.asarray(control, float)
-        if values.shape not in ((self.model.nu,), (self.num_envs, self.model.nu)):
-            rule = f"is its shape, which must be ({self.model.nu},) or ({self.num_envs}, {self.model.nu})"
-            raise InputError("control", value=values.shape, rule=rule)
-        for index in np.argwhere(~np.isfinite(values)).tolist():
-            raise InputError(f"control{index}", value=float(values[tuple(index)]), rule="must be finite")
-        return np.broadcast_to(values, (self.num_envs, self.model.nu))
-
-    def _size_if_large(self, name: str) -> str:
-        """End of a message: the diameter of a body's largest geom, if it is beyond 1 m."""
-        geoms = list(self.composed.bodies[name].geoms)
-        size = 2.0 * float(self.model.geom_rbound[geoms].max(initial=0.0))
-        return f"; it is {size:.3g} m large: are its units metres?" if size > 1.0 else ""
-
-    def _check_start(self) -> None:
-        """Raise ``InputError`` for a start in which bodies overlap.
-
-        A user's own model may start in contact, but not through a pad.
-        """
-        data, model = self.data[0], self.model
-        for contact in data.contact[: data.ncon]:
-            if contact.dist < -_OVERLAP and self.scene is not None:
-                names = [model.body(int(model.geom_bodyid[g])).name or "world" for g in contact.geom]
-                rule = f"overlap by {-contact.dist * 1e3:.3g} mm at the start: move one of them in the scene"
-                raise InputError("bodies", value=tuple(names), rule=rule)
-        for sensor, body, depth in self._pads.overlap(0):
-            if depth > (_OVERLAP if self.scene is not None else np.inf) or np.isinf(depth):
-                rule = f"must not be pressed into the pad of {sensor!r} at the start; it is, by {depth * 1e3:.3g} mm"
-                if np.isinf(depth):
-                    rule = f"must not start beyond the face that the gel of {sensor!r} is bonded to{self._size_if_large(body)}"
-                raise InputError("body", value=body, rule=rule)

@@ -69,6 +69,16 @@ def check_controls(env: int, data: mujoco.MjData) -> None:
         raise InputError(f"control[{k}]", value=float(data.ctrl[k]), rule=f"must be finite in environment {env}")
 
 
+def constant_controls(control: np.ndarray, num_envs: int, count: int) -> np.ndarray:
+    """Constant controls as (B, nu); ``count`` is nu. Raises ``InputError`` for another shape or a number that is not finite."""
+    values = np.asarray(control, float)
+    if values.shape not in ((count,), (num_envs, count)):
+        raise InputError("control", value=values.shape, rule=f"is its shape, which must be ({count},) or ({num_envs}, {count})")
+    for index in np.argwhere(~np.isfinite(values)).tolist():
+        raise InputError(f"control{index}", value=float(values[tuple(index)]), rule="must be finite")
+    return np.broadcast_to(values, (num_envs, count))
+
+
 def lost(datas: Sequence[mujoco.MjData]) -> np.ndarray:
     """True (n,) for states of MuJoCo that are not finite or have a joint far too fast."""
     speed, position = np.array([data.qvel for data in datas]), np.array([data.qpos for data in datas])

@@ -116,7 +116,7 @@ def test_rows_are_written_where_mujoco_keeps_them_and_their_forces_are_read_ther
             wanted = force * inverse - data.efc_vel[rows] / steps[b]
             np.testing.assert_allclose(data.efc_aref[rows], wanted, rtol=1e-13, atol=1e-13 * np.abs(wanted).max())
     pads.engine.end_step()
-    pads.finish(np.arange(3), world._failed)
+    pads.finish(np.arange(3), world._states.failed)
     for b, data in enumerate(world.data):
         moved = np.zeros(data.nefc)
         mujoco.mj_mulJacVec(world.model, data, moved, data.qvel)

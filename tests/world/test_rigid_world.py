@@ -13,6 +13,7 @@ import pytest
 
 from raytac.errors import InputError, SpecError
 from raytac.physics.rigid.pad import RigidPad
+from raytac.robots.impedance import JointImpedance
 from raytac.specs import BodySpec, ObjectSpec, PressScene, RobotSpec, StageSpec, TaskScene, load_sensor, load_task
 from raytac.world.world import TactileWorld
 from raytac.world.world_state import BatchController
@@ -111,8 +112,9 @@ def test_pad_frames_and_bodies_stand_where_the_scene_says() -> None:
 
 def test_a_cube_is_lifted_and_both_pads_together_carry_its_weight() -> None:
     world = TactileWorld("lift_cube", outputs=("wrench",))
-    arm, law, opening = world.arm, world._law, world.composed.opening
-    assert arm is not None and law is not None
+    arm, opening = world.arm, world.composed.opening
+    assert arm is not None
+    law = JointImpedance(arm)
 
     def steer(data: mujoco.MjData, time: float) -> None:
         joints = world.composed.start[arm.qpos].copy()
