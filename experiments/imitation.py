@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from experiments.ppo_learner import Learner
-from raytac.envs import SCRIPTED, TactileVecEnv
+from raytac.envs import SCRIPTED, TactileVecEnv, TactileVectorEnv
 
 __all__ = ["imitate", "regress"]
 
@@ -25,6 +25,7 @@ def imitate(learner: Learner) -> None:
     """
     recipe, model = learner.recipe, learner.model
     assert isinstance(learner.base, TactileVecEnv)
+    assert isinstance(learner.base.env, TactileVectorEnv)
     batch, teach, env = learner.base.env.batch, SCRIPTED[recipe.task], model.get_env()
     assert env is not None
     rng = np.random.default_rng((recipe.seed, model.num_timesteps))

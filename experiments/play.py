@@ -210,7 +210,7 @@ def _rate(args: Args, recipe: Recipe | None) -> Evaluation:
 
 def _film(args: Args, recipe: Recipe | None) -> Film:
     from experiments.ppo_learner import HELD_OUT, KINDS, Checkpoint, Learner, tactile_settings
-    from raytac.envs import SCRIPTED
+    from raytac.envs import SCRIPTED, TactileVectorEnv
 
     seed = HELD_OUT + 2 * 10**6 + args.seed
     if recipe is None:
@@ -235,7 +235,7 @@ def _film(args: Args, recipe: Recipe | None) -> Film:
     learner.restore(Checkpoint.load(Path(args.policy)))
     learner.normaliser.training = False
     seen, vectors = learner.model.get_env(), learner.base.env  # type: ignore[union-attr]
-    assert seen is not None
+    assert seen is not None and isinstance(vectors, TactileVectorEnv)
     seen.seed(seed)
     observation, frames, ended = seen.reset(), [], False
     while not ended:
