@@ -216,7 +216,8 @@ class Checkpoint:
         except FileNotFoundError as error:
             raise InputError("checkpoint", value=path, rule="must be a file that exists") from error
         except Exception as error:
-            raise InputError("checkpoint", value=path, rule=f"must be a checkpoint of train_ppo ({error})") from error
+            rule = f"must be a checkpoint of train_ppo, or of train_gpu with rsl_rl installed ({error})"
+            raise InputError("checkpoint", value=path, rule=rule) from error
 
 
 class Learner:
