@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -20,6 +21,8 @@ from raytac.errors import BackendError, RaytacError
 
 _ATTEMPTS = 3
 """Starts of a shard before it is given up, since it kills every worker."""
+_LONGEST_START = 60.0
+"""Time in which a worker that died must be back [s]."""
 
 
 class _Worker:
@@ -124,6 +127,15 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
             begun[shard] = begun.get(shard, 0) + 1
             running[actor.render.remote(shard)] = actor, shard
 
+    coming: dict[int, tuple[int, float]] = {}
+    """Shard with which each worker prepares that died, and how long it has been waited for [s]."""
+
+    def bring_back(actor: Any, shard: int, waited: float = 0.0) -> None:
+        # Until Ray has started it again every call would fail at once; one that is retried waits for that,
+        # not for ever: a worker may die each time that it prepares. A death takes two retries, its own and that of the restart.
+        coming[id(actor)] = shard, waited
+        running[actor.prepare.options(max_task_retries=2 * _ATTEMPTS).remote(shard)] = actor, None
+
     for actor in actors:
         give(actor)
     lost: list[int] = []
@@ -134,6 +146,12 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
             result = ray.get(done)
         except ray.exceptions.RayActorError as error:
             if shard is None:
+                last, waited = coming[id(actor)]
+                # A machine that is busy takes longer to start it again than Ray retries.
+                if isinstance(error, ray.exceptions.ActorUnavailableError) and waited < _LONGEST_START:
+                    time.sleep(1.0)
+                    bring_back(actor, last, waited + 1.0)
+                    continue
                 if not running:
                     text = f"no worker is left ({error}); run again to go on with the shards that are missing"
                     raise BackendError(text) from error
@@ -144,9 +162,7 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
             (waiting if again else lost).append(shard)
             if again:
                 warnings.warn(f"the worker of shard {shard} died: the shard is rendered again", RuntimeWarning, stacklevel=2)
-            # Until Ray has started it again every call would fail at once; one that is retried waits for that,
-            # not for ever: a worker may die each time that it prepares. A death takes two retries, its own and that of the restart.
-            running[actor.prepare.options(max_task_retries=2 * _ATTEMPTS).remote(shard)] = actor, None
+            bring_back(actor, shard)
             continue
         if shard is None:
             if result:

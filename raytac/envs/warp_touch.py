@@ -223,6 +223,7 @@ class _SensorTouch:
                 self._centres[:] = self._marker_rest
                 ink = wp.to_torch(self._ink(wp.from_torch(self._centres, dtype=wp.vec2d))).reshape(-1)
             self._at_rest = self._render(*at_rest, ink)[:1].clone()
+        assert self._at_rest is not None
         rest = self.cameras.apply(self._at_rest.expand_as(image), noise=False)
         return ((255 + seen.to(torch.int16) - rest) // 2).to(torch.uint8)
 

@@ -44,7 +44,8 @@ def test_every_task_is_a_gymnasium_vector_of_tensors() -> None:
             (infos["success"], torch.bool),
         ):
             assert values.shape == (2,) and values.dtype == kind
-        torch.testing.assert_close(sum(infos["reward_terms"].values(), torch.zeros(2)).float(), reward)
+        terms = torch.stack(list(infos["reward_terms"].values()))
+        torch.testing.assert_close(terms.sum(dim=0).float(), reward)
         env.close()
         with pytest.raises(InputError, match="closed"):
             env.step(action)
