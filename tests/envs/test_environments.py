@@ -61,9 +61,9 @@ def test_gymnasium_and_stable_baselines3_accept_it(kind: type) -> None:
 def test_every_name_is_registered_alone_and_as_a_vector() -> None:
     names = tuple(i for i in gymnasium.registry if i.startswith("raytac/"))
     assert sorted(names) == sorted((*raytac.envs.IDS, *raytac.envs.WARP_IDS)) and len(names) == 12
-    env = gymnasium.make("raytac/RollBall-v1", tactile=None)
+    env = gymnasium.make("raytac/RollBall-v2", tactile=None)
     assert isinstance(env.unwrapped, RollBallEnv) and "sensor_markers" not in env.observation_space.spaces  # type: ignore[attr-defined]
-    many = gymnasium.make_vec("raytac/RollBall-v1", num_envs=3, vectorization_mode="vector_entry_point", tactile=None)
+    many = gymnasium.make_vec("raytac/RollBall-v2", num_envs=3, vectorization_mode="vector_entry_point", tactile=None)
     assert isinstance(many.unwrapped, RollBallVectorEnv) and many.num_envs == 3
 
 
