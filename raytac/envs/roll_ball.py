@@ -31,17 +31,13 @@ class RollBall(Task):
         xp, ball, pad = array_namespace(state.body), state.body[:, :3, 3], state.tool[:, :3, 3]
         aside, distance = distances(ball[:, :2], pad[:, :2]), distances(ball[:, :2], state.goal[:, :2])
         force = -state.wrench["sensor"][:, 2]
-        pressed = force > 0.05
-        touching = pressed & (force < 5.0)
+        touching = (force > 0.05) & (force < 5.0)
         terms = {
-            "touching": 0.25 * touching,
+            "touching": 1.0 * touching,
             "aside": -0.05 * xp.square(100.0 * aside),
             "lost_height": -15.0 * (ball[:, 2] > 0.025),
-            "goal_wide": 0.75 * near(distance, 0.6) * pressed,
-            "goal": 1.25 * near(distance, 0.2) * pressed,
-            "goal_narrow": 1.75 * (1.0 - xp.square(xp.tanh(distance / 0.08))) * pressed,
-            "goal_fine": 4.0 * near(distance, 0.005) * pressed,
-            "reached": 5.0 * (distance < 0.002) * touching,
+            "goal_fine": 4.0 * near(distance, 0.005),
+            "reached": 5.0 * ((distance < 0.002) & touching),
         }
         off = (xp.abs(ball[:, 0] - 0.5) > 0.3) | (xp.abs(ball[:, 1]) > 0.4) | (distance > 0.75)
         terminated = off | (aside > 0.015) | (pad[:, 2] < 0.002)
@@ -68,30 +64,28 @@ class RollBallEnv(TactileEnv):
     - `sensor_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` selects others (docs/rl.md).
 
     Reward: sum of the terms in `info["reward_terms"]`, those of TacEx's ball rolling, with its constants unless a difference is given.
-    d = d_xy(ball, goal). Pressed: the ball presses the pad with more than 0.05 N. Touching: with 0.05 to 5 N (TacEx: a depth
-    of 0.5 to 4 mm).
+    d = d_xy(ball, goal). Touching: the pad is pressed with 0.05 to 5 N (TacEx: a depth of 0.5 to 4 mm).
 
     | term | value |
     | --- | --- |
-    | `touching` | 0.25 if touching |
+    | `touching` | 1 if touching (TacEx: 0.25) |
     | `aside` | −0.05 (d_xy(ball, pad) in cm)² |
     | `lost_height` | −15 if the ball's centre is above 25 mm |
-    | `goal_wide`, `goal` | 0.75 (1 − tanh(d / 0.6)), 1.25 (1 − tanh(d / 0.2)), if pressed (TacEx: always) |
-    | `goal_narrow` | 1.75 (1 − tanh²(d / 0.08)), if pressed (TacEx: always) |
-    | `goal_fine` | 4 (1 − tanh(d / 0.005)) if pressed; ours |
+    | `goal_fine` | 4 (1 − tanh(d / 0.005)); ours |
     | `reached` | 5 if d < 2 mm (TacEx: 5 mm, for goals half a metre away) and touching |
     | `action_rate`, `joint_speed` | −1e-4 \|a − a₋₁\|², −1e-4 \|q̇\|² |
 
-    TacEx's penalty of a tilted pad is left out, since no action tilts it.
+    TacEx's penalty of a tilted pad is left out, since no action tilts it. So are its three terms of the goal, made for goals half a metre
+    away: over the 10 mm of this task they change by 0.03 of 3.7.
 
     Start: the pad is 0.95 mm above the ball's position in the scene, the ball within ±2 mm of it along x and y. The goal is 5 to 10 mm from
     the ball in any direction, so that one stroke of the pad reaches it (TacEx draws goals over half a metre).
     Termination (TacEx): the ball's x is not in 0.2 to 0.8 m, |y| > 0.4 m, d > 0.75 m, d_xy(ball, pad) > 15 mm, or the pad is below 2 mm.
     Truncation: 150 steps (3 s), or the physics fails. Success: d < 2 mm.
 
-    Version 2: the goal's terms are paid only while the pad is pressed. Version 1 paid them to a pad that stands still above the ball too,
-    nine tenths of what a rolled ball earns, and one training of three stayed there.
-    Version 1: `goal_fine`. The other terms are those of goals half a metre away: over the 5 to 10 mm of this task they change by 0.03.
+    Version 2: without TacEx's three terms of the goal. They were nine tenths of what a pad earned that stands still above the ball,
+    and one training of three never did more than that. Touch is paid 1 instead of 0.25.
+    Version 1: `goal_fine`, beside these terms.
     Version 0: first release.
     """
 
