@@ -47,14 +47,21 @@ def test_bad_options_are_refused_before_anything_is_written(tmp_path: Path) -> N
     ):
         with pytest.raises(InputError, match=text):
             bench.main(bench.Args(out=out, device="cpu", **options))
-    for options, text in (({"task": "pull"}, "balance"), ({"steps": 0}, "1 or more"), ({"modalities": "smell"}, "markers")):
+    for options, text in (({"task": "pull"}, "InsertPeg"), ({"steps": 0}, "1 or more"), ({"modalities": "smell"}, "markers")):
         with pytest.raises(InputError, match=text):
             soak.main(soak.Args(out=out, device="cpu", **options))
     assert not out.exists()
 
 
 def test_a_soak_run_counts_and_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    options: dict[str, Any] = {"out": tmp_path, "device": "cpu", "envs": 2, "modalities": "wrench", "block": 4, "task": "roll"}
+    options: dict[str, Any] = {
+        "out": tmp_path,
+        "device": "cpu",
+        "envs": 2,
+        "modalities": "wrench",
+        "block": 4,
+        "task": "RollBall",
+    }
     with monkeypatch.context() as patch:
         write, calls = soak.store, []
 
@@ -70,8 +77,8 @@ def test_a_soak_run_counts_and_goes_on_where_it_was_stopped(tmp_path: Path, monk
     assert not (tmp_path / "metrics.json").exists()
     soak.main(soak.Args(steps=20, **options))
     found = read_metrics(tmp_path / "metrics.json")
-    assert found["roll.steps"] == 20 and found["roll.sittings"] == 2
-    assert found["roll.nonfinite"] == found["roll.failed"] == 0 and float(found["roll.memory_mb"]) > 50.0
+    assert found["RollBall.steps"] == 20 and found["RollBall.sittings"] == 2
+    assert found["RollBall.nonfinite"] == found["RollBall.failed"] == 0 and float(found["RollBall.memory_mb"]) > 50.0
     with pytest.raises(InputError, match="other settings"):
         soak.main(soak.Args(steps=20, **{**options, "envs": 3}))
 
