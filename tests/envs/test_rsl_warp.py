@@ -15,6 +15,8 @@ import torch
 from raytac.envs import RollBallVectorEnv
 from raytac.envs.rsl import RslVecEnv, RslWarpEnv
 
+pytestmark = pytest.mark.timeout(1200)  # the first test compiles MuJoCo Warp for the CPU: minutes
+
 
 def test_rsl_rl_trains_on_observations_of_the_same_sizes() -> None:
     """Markers, in four environments, for 30 steps of episodes of 12."""
