@@ -69,7 +69,6 @@ PLACES: dict[str, tuple[str, ...]] = {
         "world/test_mujoco_rows.py",
         "world/test_pad_shear.py",
         "world/test_soft_world.py",
-        "world/test_warp_states.py",
     ),
     "script": (
         "dataset/test_ray_cluster.py",
