@@ -17,7 +17,7 @@ import torch
 
 from experiments import play, train_gpu
 from experiments.flat_policy import FlatPolicy
-from raytac.envs import RollBallVectorEnv
+from raytac.envs import SCRIPTED, RollBallVectorEnv
 from raytac.envs.rsl import RslVecEnv
 from raytac.errors import InputError
 from raytac.io import read_metrics
@@ -91,6 +91,10 @@ def test_a_training_that_was_cut_ends_as_one_that_was_not(tmp_path: Path) -> Non
     for wrong in ({"history": 0}, {"steps": -5}, {"touch": "wrench,taste"}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             replace(cut, **wrong)
+
+
+def test_every_task_has_steps_to_train_for() -> None:
+    assert set(train_gpu.STEPS) == set(SCRIPTED)
 
 
 def test_observations_are_there_before_a_reset() -> None:
