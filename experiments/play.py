@@ -32,7 +32,8 @@ from raytac.report import machine
 
 if TYPE_CHECKING:
     from experiments.flat_policy import FlatPolicy
-    from experiments.ppo_learner import Evaluation, Recipe
+    from experiments.ppo_learner import Recipe
+    from experiments.training import Evaluation
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +123,7 @@ def _flat(args: Args) -> FlatPolicy | None:
 
 def _flat_rate(args: Args, policy: FlatPolicy) -> Evaluation:
     """Over held-out seeds, those of ``_rate``."""
-    from experiments.ppo_learner import HELD_OUT, Evaluation
+    from experiments.training import HELD_OUT, Evaluation
 
     many = policy.vector(_together(args), device=args.device)
     returns, lengths, successes, failures = [], [], 0, 0
@@ -145,7 +146,7 @@ def _flat_rate(args: Args, policy: FlatPolicy) -> Evaluation:
 
 def _flat_film(args: Args, policy: FlatPolicy) -> Film:
     """The episode of ``_film``; image and markers are shown, whatever the policy is given."""
-    from experiments.ppo_learner import HELD_OUT, KINDS
+    from experiments.training import HELD_OUT, KINDS
 
     felt = KINDS[policy.task].task.tactile if policy.touch == "task" else policy.tactile or ()
     every = tuple(name for name in MODALITIES if name in (*felt, "rgb", "markers"))
@@ -184,10 +185,12 @@ def _together(args: Args) -> int:
 
 def _rate(args: Args, recipe: Recipe | None) -> Evaluation:
     """Over held-out seeds."""
-    from experiments.ppo_learner import HELD_OUT, KINDS, Checkpoint, Evaluation, Learner, evaluate
+    from experiments.training import HELD_OUT, KINDS, Evaluation
     from raytac.envs import SCRIPTED
 
     if recipe is not None:
+        from experiments.ppo_learner import Checkpoint, Learner, evaluate
+
         learner = Learner(recipe)
         learner.restore(Checkpoint.load(Path(args.policy)))
         return evaluate(learner, args.episodes, first_seed=2 * 10**6)
@@ -209,7 +212,7 @@ def _rate(args: Args, recipe: Recipe | None) -> Evaluation:
 
 
 def _film(args: Args, recipe: Recipe | None) -> Film:
-    from experiments.ppo_learner import HELD_OUT, KINDS, Checkpoint, Learner, tactile_settings
+    from experiments.training import HELD_OUT, KINDS
     from raytac.envs import SCRIPTED, TactileVectorEnv
 
     seed = HELD_OUT + 2 * 10**6 + args.seed
@@ -223,6 +226,8 @@ def _film(args: Args, recipe: Recipe | None) -> Film:
             _, _, terminated, truncated, _ = env.step(np.clip(policy(env.batch), -1.0, 1.0))
             ended = bool(terminated[0] or truncated[0])
         return Film(frames, env.batch.control_timestep, tuple(env.batch.observers))
+    from experiments.ppo_learner import Checkpoint, Learner, tactile_settings
+
     settings = tactile_settings(recipe.tactile, recipe.resolution)
     told = KINDS[recipe.task].task.tactile if settings == "task" else () if settings is None else settings.modalities  # type: ignore[union-attr]
     if "rgb" in told:

@@ -19,19 +19,15 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
-import raytac.envs
+from experiments.training import HELD_OUT, KINDS, Evaluation
 from raytac.checks import check_number, check_numbers, check_seed, check_whole
-from raytac.envs import SCRIPTED, ProcessVecEnv, TactileVecEnv, TactileVectorEnv
+from raytac.envs import ProcessVecEnv, TactileVecEnv
 from raytac.errors import InputError
 from raytac.io import write_atomic
 from raytac.observe import ObservationSettings
-from raytac.report import wilson_interval
 
-__all__ = ["HELD_OUT", "KINDS", "SMALLEST_SIDE", "Checkpoint", "Evaluation", "Learner", "Recipe", "evaluate", "tactile_settings"]
+__all__ = ["SMALLEST_SIDE", "Checkpoint", "Learner", "Recipe", "evaluate", "tactile_settings"]
 
-KINDS: Mapping[str, type[TactileVectorEnv]] = {name: getattr(raytac.envs, f"{name}VectorEnv") for name in SCRIPTED}
-HELD_OUT = 2**31
-"""Seeds of evaluation start here; those of training are below."""
 SMALLEST_SIDE = 36
 """Smallest side of an image [px] for DQN's convolutions (``NatureCNN``, which ``MultiInputPolicy`` uses too)."""
 _SMALL = 64
@@ -86,23 +82,6 @@ class Recipe:
         for name in ("task", "tactile", "device"):
             if not isinstance(getattr(self, name), str):
                 raise InputError(name, value=getattr(self, name), rule="must be a name")
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Episodes of the deterministic policy on held-out seeds; success is that of an episode's last step."""
-
-    episodes: int
-    successes: int
-    mean_return: float
-    mean_length: float
-    failures: int
-    """Episodes that ended because the physics broke down."""
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Wilson's 95 % interval of the success rate."""
-        return wilson_interval(self.successes, self.episodes)
 
 
 def tactile_settings(name: str, resolution: str) -> ObservationSettings | str | None:

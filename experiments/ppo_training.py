@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import io
 import random
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -26,9 +25,10 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
 from experiments.imitation import imitate
-from experiments.ppo_learner import HELD_OUT, Checkpoint, Learner, Recipe, evaluate
+from experiments.ppo_learner import Checkpoint, Learner, Recipe, evaluate
+from experiments.training import append_row, keep_rows, segment_seed
 from raytac.errors import InputError
-from raytac.io import FolderLock, write_atomic
+from raytac.io import FolderLock
 
 __all__ = ["Training"]
 
@@ -85,7 +85,7 @@ class Training:
         if saved is not None:
             self.learner.restore(saved)
         for name in ("progress.csv", "evaluation.csv"):
-            _keep_rows(folder / name, self.steps)
+            keep_rows(folder / name, self.steps)
         self._wall = max(_last_wall(folder / name) for name in ("progress.csv", "evaluation.csv"))
         from stable_baselines3.common.logger import Logger, make_output_format
 
@@ -113,14 +113,14 @@ class Training:
         _seed_all(recipe.seed, self.steps)
         env = model.get_env()
         assert env is not None
-        env.seed(_training_seed(recipe.seed, self.steps))
+        env.seed(segment_seed(recipe.seed, self.steps))
         begin = time.perf_counter()
         if self.steps < recipe.imitation_steps:
             imitate(self.learner)
             self._wall += time.perf_counter() - begin
             return self._conclude()
         model._last_obs = None  # so that learn resets
-        progress = _Progress(lambda row: _append(self.folder / "progress.csv", row), self._wall)
+        progress = _Progress(lambda row: append_row(self.folder / "progress.csv", row), self._wall)
         todo = min(recipe.segment * recipe.n_steps * recipe.num_envs, recipe.total_timesteps - self.steps)
         model.learn(todo, progress, log_interval=1, reset_num_timesteps=False)
         self._wall += time.perf_counter() - begin
@@ -137,7 +137,7 @@ class Training:
             "return": result.mean_return, "length": result.mean_length,
         }  # fmt: skip
         # Before the checkpoint: a row too many is dropped by a resume, one that is missing never comes back.
-        _append(self.folder / "evaluation.csv", row)
+        append_row(self.folder / "evaluation.csv", row)
         self.learner.checkpoint().save(self.path)
         self._say(
             f"{recipe.task} {recipe.tactile} seed {recipe.seed}: {self.steps} steps, {self._wall:.0f} s, "
@@ -151,40 +151,11 @@ class Training:
         return self._wall
 
 
-def _training_seed(seed: int, steps: int) -> int:
-    return int(np.random.SeedSequence([seed, steps]).generate_state(1)[0]) % (HELD_OUT - 2**20)
-
-
 def _seed_all(seed: int, steps: int) -> None:
     word = int(np.random.SeedSequence([seed, steps, 1]).generate_state(1)[0])
     random.seed(word)
     np.random.seed(word)
     torch.manual_seed(word)
-
-
-def _append(path: Path, row: Mapping[str, Any]) -> None:
-    fresh = not path.exists()
-    with path.open("a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(row))
-        if fresh:
-            writer.writeheader()
-        writer.writerow(row)
-
-
-def _keep_rows(path: Path, steps: int) -> None:
-    """Drop rows that a training beyond its last checkpoint has left."""
-    if not path.exists():
-        return
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = [row for row in csv.DictReader(file) if int(row["steps"]) <= steps]
-    if not rows:
-        path.unlink()
-        return
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, list(rows[0]))
-    writer.writeheader()
-    writer.writerows(rows)
-    write_atomic(path, text.getvalue().encode())
 
 
 def _last_wall(path: Path) -> float:

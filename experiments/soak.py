@@ -1,11 +1,11 @@
 """Do the tasks run on and on? Random actions for 100,000 environment steps each: exceptions, numbers that are not finite, memory.
 
     python experiments/soak.py --out runs/soak
-    python experiments/soak.py --task roll --steps 2000 --out runs/soak_roll
+    python experiments/soak.py --task RollBall --steps 2000 --out runs/soak_roll
 
 Every block of steps is recorded in ``<task>.json``; a run that was interrupted goes on after its last block, with new episodes. An
 exception ends the run where it is raised. Memory grows by what the process holds after a sitting's last block beyond what it held after a
-tenth of its blocks: by then what is made once is made, such as kernels for every number of environments that begin anew together.
+tenth of its blocks: by then what is made once is made, such as kernels for every number of environments that begin again together.
 """
 
 from __future__ import annotations
@@ -18,26 +18,19 @@ from pathlib import Path
 import numpy as np
 
 from experiments.running import resumed, run, store
+from experiments.training import KINDS
 from raytac.device import resolve_device
-from raytac.envs import BalancePoleVectorEnv, LiftCubeVectorEnv, PushCubeVectorEnv, RollBallVectorEnv, TactileVectorEnv
 from raytac.errors import InputError
 from raytac.io import VERSIONED, CommonOptions, FolderLock, Metric, parse_names, versions, write_metrics
 from raytac.observe import MODALITIES, ObservationSettings
 from raytac.report import machine
-
-TASKS: dict[str, type[TactileVectorEnv]] = {
-    "push": PushCubeVectorEnv,
-    "balance": BalancePoleVectorEnv,
-    "lift": LiftCubeVectorEnv,
-    "roll": RollBallVectorEnv,
-}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Args(CommonOptions):
     """Random actions in vectors of environments."""
 
-    task: str = ",".join(TASKS)
+    task: str = ",".join(KINDS)
     """Which tasks, joined by commas."""
     steps: int = 100_000
     """Environment steps of each task."""
@@ -69,7 +62,7 @@ class Block:
 def main(args: Args) -> dict[str, Metric]:
     """Run what is missing of every task and write ``metrics.json``."""
     start = time.perf_counter()
-    names = parse_names(args.task, "task", tuple(TASKS))
+    names = parse_names(args.task, "task", tuple(KINDS))
     modalities = parse_names(args.modalities, "modalities", MODALITIES)
     for name, value in (("steps", args.steps), ("envs", args.envs), ("block", args.block)):
         if value < 1:
@@ -95,7 +88,7 @@ def remaining_blocks(name: str, args: Args, modalities: tuple[str, ...], blocks:
     if done >= args.steps:
         return blocks
     blocks, sitting = list(blocks), blocks[-1].sitting + 1 if blocks else 0
-    env = TASKS[name](args.envs, tactile=ObservationSettings(modalities), device=args.device, seed=args.seed)
+    env = KINDS[name](args.envs, tactile=ObservationSettings(modalities), device=args.device, seed=args.seed)
     env.reset(seed=args.seed + done)
     rng = np.random.default_rng((args.seed, done))
     while done < args.steps:

@@ -8,7 +8,8 @@ The critic is asymmetric: in training it is given the body's pose and velocity a
 given. The policy never is. Each pair of touch and seed is one training in ``<out>/<touch>/seed<k>/``: ``progress.csv`` (one row some
 iterations), ``evaluation.csv`` (held-out episodes of the deterministic policy), ``checkpoint.pt``, ``policy.pt`` and ``metrics.json``;
 TensorBoard's events too, where it is installed. The same command again goes on from the checkpoint, after Ctrl-C, a crash or ``--minutes``.
-``<out>/metrics.json`` has the trainings of all seeds: ``<device>.<task>.success`` is that of the worst.
+``<out>/metrics.json`` has the trainings of all seeds: ``<device>.<task>.success`` is that of the worst, ``<device>.<task>.minutes`` and
+``<device>.train.env_steps_per_s`` (the median over iterations, each a rollout and an update) are those of the slowest.
 
 Worlds are stepped on the CPU, in ``--processes`` processes, or with ``--worlds mujoco_warp`` on ``--device``, where the networks are.
 """
@@ -19,7 +20,6 @@ Worlds are stepped on the CPU, in ``--processes`` processes, or with ``--worlds 
 from __future__ import annotations
 
 import contextlib
-import csv
 import io
 import multiprocessing
 import sys
@@ -33,6 +33,7 @@ import numpy as np
 
 import raytac.envs
 from experiments.running import run
+from experiments.training import HELD_OUT, Evaluation, append_row, keep_rows, parse_seeds, segment_seed
 from raytac.checks import check_known, check_names, check_number, check_whole
 from raytac.errors import InputError
 from raytac.io import (
@@ -47,7 +48,7 @@ from raytac.io import (
     write_metrics,
 )
 from raytac.observe import MODALITIES
-from raytac.report import machine, wilson_interval
+from raytac.report import machine
 
 if multiprocessing.parent_process() is None:  # processes of environments import this file too, and need none of these
     import torch
@@ -57,14 +58,14 @@ if multiprocessing.parent_process() is None:  # processes of environments import
 
     from raytac.envs import RslVecEnv, RslWarpEnv
 
-TASKS = ("PushCube", "BalancePole", "LiftCube", "RollBall")
 WORLDS = ("mujoco", "mujoco_warp")
 HISTORY = {"BalancePole": 3, "RollBall": 3}
 """Last observations that the policy is given, where it is more than one: what is known by touch alone shows in how it changes."""
-STEPS = {"PushCube": 1_000_000, "BalancePole": 4_000_000, "LiftCube": 6_000_000, "RollBall": 2_000_000}
-"""Environment steps of a training."""
-HELD_OUT = 2**31
-"""Seeds of evaluation start here; those of training are below."""
+STEPS = {
+    "PushCube": 1_000_000, "BalancePole": 4_000_000, "LiftCube": 6_000_000, "RollBall": 2_000_000, "InsertPeg": 20_000_000,
+    "OpenDrawer": 20_000_000,
+}  # fmt: skip
+"""Environment steps of a training by task; those of the last two are a guess."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +73,7 @@ class Args(CommonOptions):
     """Train a task by PPO alone; ``seed`` is not used, see ``seeds``."""
 
     task: str = "PushCube"
-    """One of PushCube, BalancePole, LiftCube, RollBall."""
+    """One of PushCube, BalancePole, LiftCube, RollBall, InsertPeg, OpenDrawer."""
     touch: str = "wrench"
     """What is felt, joined by commas, each trained with the same seeds: ``none``, ``task`` (as the environment has it), or modalities
     joined by ``+``, as in ``markers+wrench``. The first is that of the headline in ``metrics.json``."""
@@ -122,8 +123,7 @@ class Args(CommonOptions):
     """Width of the two layers of policy and critic."""
 
     def __post_init__(self) -> None:
-        if self.task not in TASKS:
-            raise InputError("task", value=self.task, rule="must be a known task", choices=TASKS)
+        check_known("task", self.task, tuple(STEPS))
         for name in ("num_envs", "threads", "episodes", "evaluate_every", "rollout", "epochs", "minibatches", "hidden"):
             check_whole(name, getattr(self, name))
         check_whole("processes", self.processes, 0)
@@ -142,18 +142,6 @@ class Args(CommonOptions):
                 check_number(name, getattr(self, name), interval)
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """Held-out episodes of the deterministic policy; success is that of an episode's last step."""
-
-    episodes: int
-    successes: int
-    failures: int
-    """Episodes that ended because the physics broke down."""
-    mean_return: float
-    mean_length: float
-
-
 class Training:
     """One training in a folder: environments, networks, PPO."""
 
@@ -168,7 +156,7 @@ class Training:
         tactile: Any = {"none": None, "task": "task"}.get(touch, tuple(touch.split("+")))
         kind: Any = getattr(raytac.envs, f"{args.task}VectorEnv")
         common: Any = {
-            "num_envs": args.num_envs, "device": self.device, "seed": _seed(seed, 0), "history": self.settings["history"],
+            "num_envs": args.num_envs, "device": self.device, "seed": segment_seed(seed, 0), "history": self.settings["history"],
             "tactile": tactile,
         }  # fmt: skip
         if args.worlds == "mujoco":
@@ -198,7 +186,7 @@ class Training:
             self._start -= saved["wall_s"]
             self.ppo.load(saved, None, True)
             for name in ("progress.csv", "evaluation.csv"):
-                _keep_rows(folder / name, self.steps)
+                keep_rows(folder / name, self.steps)
         self._writer: Any = None
         with contextlib.suppress(ImportError):  # not installed: the CSV files hold all that it would show
             from torch.utils.tensorboard import SummaryWriter
@@ -208,8 +196,8 @@ class Training:
 
     def _begin_episodes(self) -> None:
         """Start all environments at random ages, so that they do not end together; seeds follow from the run's and the iteration."""
-        torch.manual_seed(_seed(self.seed, self.iteration))
-        self.observation = self.env.reset(_seed(self.seed, self.iteration))
+        torch.manual_seed(segment_seed(self.seed, self.iteration))
+        self.observation = self.env.reset(segment_seed(self.seed, self.iteration))
         ages = np.random.default_rng([self.seed, self.iteration]).integers(0, self.env.max_episode_length, self.env.num_envs)
         self.env.episode_length_buf = torch.from_numpy(ages)
 
@@ -245,7 +233,7 @@ class Training:
 
     def log(self, row: Mapping[str, float]) -> None:
         """Append a row to ``progress.csv`` and to TensorBoard's events."""
-        _append(
+        append_row(
             self.folder / "progress.csv",
             {name: float(f"{value:.5g}") if name != "steps" else value for name, value in row.items()},
         )
@@ -273,14 +261,14 @@ class Training:
                     )
                     running &= ~ended
         self._begin_episodes()
-        result = Evaluation(played, successes, failures, float(np.mean(returns)), float(np.mean(lengths)))
-        low, high = wilson_interval(successes, played)
+        result = Evaluation(played, successes, float(np.mean(returns)), float(np.mean(lengths)), failures)
+        low, high = result.interval
         row = {
             "steps": self.steps, "wall_s": round(self.wall_s, 2), "episodes": played, "success": successes / played,
             "low": round(low, 4), "high": round(high, 4), "failed": failures, "return": round(result.mean_return, 2),
             "length": round(result.mean_length, 1),
         }  # fmt: skip
-        _append(self.folder / "evaluation.csv", row)
+        append_row(self.folder / "evaluation.csv", row)
         return result
 
     def save(self) -> None:
@@ -314,10 +302,11 @@ def train(args: Args, touch: str, seed: int, folder: Path) -> None:
         print(f"{args.task} {touch} seed {seed}: done before, in {folder}", flush=True)
         return
     with FolderLock(folder), contextlib.closing(Training(args, touch, seed, folder)) as training:
-        name, reached = f"{args.task} {touch} seed {seed}", False
+        name, reached, speeds = f"{args.task} {touch} seed {seed}", False, []
         due = training.steps + args.evaluate_every
         while training.steps < total and not reached:
             row = training.iterate()
+            speeds.append(row["env_steps_per_s"])
             if training.iteration % 10 == 0:
                 training.log(row)
                 print(
@@ -336,12 +325,13 @@ def train(args: Args, touch: str, seed: int, folder: Path) -> None:
         trained_s = training.wall_s
         result = training.evaluate(args.episodes, first_seed=10**6)
         training.save()
-        low, high = wilson_interval(result.successes, result.episodes)
+        low, high = result.interval
         found: dict[str, Metric] = {
             "env_steps": training.steps, "done": int(reached or training.steps >= total), "minutes": trained_s / 60.0,
             "episodes": result.episodes, "failed": result.failures,
             "success": result.successes / result.episodes, "success_low": low, "success_high": high, "return": result.mean_return,
             "length": result.mean_length, "env_steps_per_s": training.steps / trained_s, "processes": args.processes,
+            "num_envs": args.num_envs, "worlds": args.worlds, **({"train_env_steps_per_s": float(np.median(speeds))} if speeds else {}),
         }  # fmt: skip
         write_metrics(
             folder / "metrics.json",
@@ -359,7 +349,7 @@ def main(args: Args) -> dict[str, Metric]:
     torch.set_num_threads(args.threads)
     out = args.folder("train_gpu", args.task)
     touches = parse_names(args.touch, "touch")
-    seeds = [_whole(text) for text in parse_names(args.seeds, "seeds")]
+    seeds = parse_seeds(args.seeds)
     interrupted = False
     try:
         for touch in touches:
@@ -379,6 +369,9 @@ def main(args: Args) -> dict[str, Metric]:
         if touch == touches[0] and rows:
             found[f"{device}.{args.task}.success"] = min(float(row["success"]) for row in rows.values())
             found[f"{device}.{args.task}.minutes"] = max(float(row["minutes"]) for row in rows.values())
+            speeds = [float(row["train_env_steps_per_s"]) for row in rows.values() if "train_env_steps_per_s" in row]
+            if speeds:
+                found[f"{device}.train.env_steps_per_s"] = min(speeds)
     found |= {"wall_s": time.perf_counter() - start} | versions((*VERSIONED, "gymnasium", "rsl_rl_lib", "torch"))
     write_metrics(out / "metrics.json", found)
     print(f"written: {out}")
@@ -429,35 +422,6 @@ def _settings(args: Args, touch: str, seed: int) -> dict[str, Any]:
     )
     kept = {name: value for name, value in asdict(args).items() if name not in free}
     return kept | {"touch": touch, "seed": seed, "history": HISTORY.get(args.task, 1) if args.history is None else args.history}
-
-
-def _seed(seed: int, iteration: int) -> int:
-    """Seed of the first environment."""
-    return int(np.random.SeedSequence([seed, iteration]).generate_state(1)[0]) % (HELD_OUT - 2**20)
-
-
-def _whole(text: str) -> int:
-    if not text.isdecimal():
-        raise InputError("seeds", value=text, rule="must be whole numbers >= 0 joined by commas")
-    return int(text)
-
-
-def _append(path: Path, row: Mapping[str, Any]) -> None:
-    fresh = not path.exists()
-    with path.open("a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(row))
-        if fresh:
-            writer.writeheader()
-        writer.writerow(row)
-
-
-def _keep_rows(path: Path, steps: int) -> None:
-    """Drop rows that a training beyond its last checkpoint has left."""
-    if not path.exists():
-        return
-    lines = path.read_text("utf-8").splitlines()
-    kept = [lines[0], *(line for line in lines[1:] if int(line.split(",")[0]) <= steps)]
-    write_atomic(path, ("\n".join(kept) + "\n").encode())
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.running import run
+from experiments.training import parse_seeds
 from raytac.errors import InputError, RaytacError
 from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, versions, write_metrics
 from raytac.report import machine
@@ -107,7 +108,7 @@ def main(args: Args) -> dict[str, Metric]:
     if args.task not in TASKS:
         raise InputError("task", value=args.task, rule="must be a known task", choices=TASKS)
     kinds = parse_names(args.tactile, "tactile")
-    seeds = [_whole(text) for text in parse_names(args.seeds, "seeds")]
+    seeds = parse_seeds(args.seeds)
     from experiments.ppo_learner import Recipe, tactile_settings
 
     for kind in kinds:  # so that a modality that cannot be observed is an error before any training
@@ -139,12 +140,6 @@ def main(args: Args) -> dict[str, Metric]:
 
 def _out(args: Args) -> Path:
     return args.out or Path("runs/train_ppo") / args.task
-
-
-def _whole(text: str) -> int:
-    if not text.isdecimal():
-        raise InputError("seeds", value=text, rule="must be whole numbers >= 0 joined by commas")
-    return int(text)
 
 
 def _train(job: _Job) -> None:

@@ -191,6 +191,7 @@ def _no_denoiser() -> str:
 
 
 _VIEW = "import viser, websockets, msgspec; print('viser', viser.__version__)"
+_GPU = "import mujoco_warp; print('mujoco-warp imported')"
 _RL = "import gymnasium, mink; print('gymnasium', gymnasium.__version__)"
 
 PROBES = (
@@ -225,6 +226,10 @@ PROBES = (
     Probe(
         "view", _VIEW, False, "pip install 'raytac[view]'",
         _absent("raytac view needs it", "viser", "websockets", "msgspec"),
+    ),
+    Probe(
+        "mujoco-warp", _GPU, False, "pip install 'raytac[gpu]'",
+        _absent("worlds on MuJoCo Warp, thousands on one GPU, need it", "mujoco_warp"),
     ),
     Probe(
         "rl", _RL, False, "pip install 'raytac[rl]'",

@@ -8,6 +8,7 @@ import sys
 import pytest
 
 VIEWER = "the viewer is not installed: pip install 'raytac[view]'"
+VECTOR = "import gymnasium, raytac.envs; gymnasium.make_vec('raytac/PushCubeWarp-v0')"
 MISSING = """
 import importlib.abc, importlib.util, sys
 lost = {lost!r}
@@ -18,7 +19,7 @@ importlib.util.find_spec = lambda name, package=None: None if name in lost else 
 class Without(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path=None, target=None):
         if name.partition(".")[0] in lost:
-            raise ModuleNotFoundError(f"No module named {{name!r}}")
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 
 
 sys.meta_path.insert(0, Without())
@@ -32,6 +33,9 @@ sys.meta_path.insert(0, Without())
         (("msgspec",), "from raytac.view import Viewer", VIEWER),
         (("gymnasium",), "from raytac.observe import AddTactile", "pip install 'raytac[rl]'"),
         (("gymnasium",), "import raytac.envs", "pip install 'raytac[rl]'"),
+        (("torch",), "from raytac.envs import WarpBatch", "WarpBatch needs PyTorch, which is not installed: pip install 'raytac[rl]'"),
+        (("torch",), VECTOR, "pip install 'raytac[rl]'"),
+        (("mujoco_warp",), "import raytac; raytac.TactileWorld('push_cube', engine='mujoco_warp')", "pip install 'raytac[gpu]'"),
     ],
 )  # fmt: skip
 def test_what_is_not_installed_is_named_with_its_extra(lost: tuple[str, ...], code: str, message: str) -> None:

@@ -12,11 +12,12 @@ from pathlib import Path
 import pytest
 
 import raytac
+from raytac.errors import BackendError
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ["raytac", *(f"raytac.{module.name}" for module in pkgutil.iter_modules(raytac.__path__) if module.ispkg)]
 ABSENT = ("rsl_rl", "stable_baselines3", "torch")
-"""Packages that no extra of the tests installs: names that need them say so when they are used."""
+"""Packages that the extra of the tests does not install: names that need them say so when they are used."""
 USERS = [
     ROOT / "README.md",
     *(path for folder in ("docs", "scenes", "lights") for path in sorted((ROOT / folder).rglob("*.md"))),
@@ -34,8 +35,10 @@ def test_every_public_name_can_be_imported(name: str) -> None:
     for public in package.__all__:
         try:
             getattr(package, public)
-        except ModuleNotFoundError as error:
-            assert error.name in ABSENT, f"{name}.{public}: {error}"
+        except BackendError as error:
+            lacking = error.__cause__
+            assert isinstance(lacking, ModuleNotFoundError) and lacking.name in ABSENT, f"{name}.{public}: {error}"
+            assert public in str(error) and "pip install" in str(error)
     with pytest.raises(AttributeError, match="no_such_name"):
         getattr(package, "no_such_name")  # noqa: B009 (a type checker would refuse the attribute itself)
 

@@ -37,5 +37,5 @@ def register_envs() -> None:
         if _NAMES[name] not in gymnasium.registry:
             where = f"raytac.envs.{module}:{name}"
             gymnasium.register(_NAMES[name], entry_point=f"{where}Env", vector_entry_point=f"{where}VectorEnv")
-            vector = "raytac.envs.warp_vector:WarpVectorEnv"
+            vector = "raytac.envs:WarpVectorEnv"  # which names what is not installed
             gymnasium.register(_WARP_NAMES[name], vector_entry_point=vector, kwargs={"task": name})

@@ -84,7 +84,7 @@ class WarpTouch:
 
     def begin(self, mask: torch.Tensor) -> None:
         """Begin episodes of a mask (B,): empty their stacks and draw their cameras again."""
-        self._fresh |= mask
+        self._fresh = self._fresh | mask
         for sensor in self._sensors.values():
             if sensor.cameras is not None:
                 sensor.cameras.begin(mask)

@@ -17,7 +17,7 @@ import torch
 
 from experiments import play, train_gpu
 from experiments.flat_policy import FlatPolicy
-from raytac.envs import RollBallVectorEnv
+from raytac.envs import SCRIPTED, RollBallVectorEnv
 from raytac.envs.rsl import RslVecEnv
 from raytac.errors import InputError
 from raytac.io import read_metrics
@@ -93,6 +93,10 @@ def test_a_training_that_was_cut_ends_as_one_that_was_not(tmp_path: Path) -> Non
             replace(cut, **wrong)
 
 
+def test_every_task_has_steps_to_train_for() -> None:
+    assert set(train_gpu.STEPS) == set(SCRIPTED)
+
+
 def test_observations_are_there_before_a_reset() -> None:
     env = RslVecEnv(RollBallVectorEnv, num_envs=2, tactile=("wrench",), seed=3)
     first = env.get_observations()
@@ -107,6 +111,8 @@ def test_metrics_are_of_the_worst_seed_of_the_first_touch(tmp_path: Path, monkey
         train_gpu.Training, "evaluate", lambda self, *a, **k: replace(played(self, *a, **k), successes=next(successes))
     )
     found = train_gpu.main(replace(SMALL, steps=16, seeds="0,1", touch="none,wrench", out=tmp_path))
+    speeds = [float(found[f"none.seed{k}.train_env_steps_per_s"]) for k in (0, 1)]  # type: ignore[arg-type]
+    assert found["cpu.train.env_steps_per_s"] == min(speeds) > 0.0 and found["none.seed0.worlds"] == "mujoco"
     assert found["cpu.RollBall.success"] == 0.25 and found["none.seed0.success"] == 0.75 and found["wrench.seed1.success"] == 0.0
     assert read_metrics(tmp_path / "metrics.json") == found
     rows = (tmp_path / "none/seed0/evaluation.csv").read_text().splitlines()

@@ -5,15 +5,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 pytest.importorskip("mujoco_warp")
-pytest.importorskip("rsl_rl.env", exc_type=ImportError)
+pytest.importorskip("rsl_rl.algorithms", exc_type=ImportError)
 
 import torch
 
+from experiments import train_gpu
+from experiments.flat_policy import FlatPolicy
 from raytac.envs import RollBallVectorEnv
 from raytac.envs.rsl import RslVecEnv, RslWarpEnv
+
+pytestmark = pytest.mark.timeout(1200)  # the first test compiles MuJoCo Warp for the CPU: minutes
 
 
 def test_rsl_rl_trains_on_observations_of_the_same_sizes() -> None:
@@ -43,3 +49,15 @@ def test_rsl_rl_trains_on_observations_of_the_same_sizes() -> None:
     env.episode_length_buf = torch.full((4,), 11)
     assert env.step(actions)[2].tolist() == [1.0] * 4 and env.episode_length_buf.tolist() == [0] * 4
     env.close()
+
+
+def test_a_training_on_mujoco_warp_writes_what_the_benchmarks_ask_for(tmp_path: Path) -> None:
+    """One iteration in four worlds, with markers and wrench, and its policy is played."""
+    args = train_gpu.Args(
+        task="PushCube", touch="markers+wrench", worlds="mujoco_warp", num_envs=4, rollout=4, steps=16, minibatches=2, epochs=1,
+        episodes=2, hidden=8, device="cpu", out=tmp_path,
+    )  # fmt: skip
+    found = train_gpu.main(args)
+    assert 0.0 <= float(found["cpu.PushCube.success"]) <= 1.0 and float(found["cpu.PushCube.minutes"]) > 0.0
+    assert float(found["cpu.train.env_steps_per_s"]) > 0.0 and found["markers_wrench.seed0.worlds"] == "mujoco_warp"
+    assert FlatPolicy(tmp_path / "markers+wrench/seed0/policy.pt").tactile == ("markers", "wrench")

@@ -22,6 +22,8 @@ from raytac.errors import InputError
 from raytac.markers import MarkerPerturbation
 from raytac.observe import MODALITIES, ObservationSettings, Randomization
 
+pytestmark = pytest.mark.timeout(1200)  # the first test compiles MuJoCo Warp for the CPU: minutes
+
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 

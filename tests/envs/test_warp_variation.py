@@ -21,6 +21,8 @@ from raytac.markers import MarkerPerturbation
 from raytac.observe import ObservationSettings, Randomization
 from raytac.world.engine.mjwarp import _VARIED
 
+pytestmark = pytest.mark.timeout(1200)  # the first test compiles MuJoCo Warp for the CPU: minutes
+
 WIDTHS: dict[str, Any] = {
     "body_mass": 0.3, "body_friction": 0.2, "youngs_modulus": 0.2, "friction": 0.2, "pad_shift": 3e-4, "pad_turn": 0.02,
 }  # fmt: skip

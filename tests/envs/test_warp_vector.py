@@ -21,6 +21,8 @@ from raytac.envs import PushCube, WarpBatch, WarpVectorEnv
 from raytac.errors import InputError
 from raytac.observe import ObservationSettings
 
+pytestmark = pytest.mark.timeout(1200)  # the first test compiles MuJoCo Warp for the CPU: minutes
+
 SEEN = ObservationSettings(("markers", "wrench"), stack=2)
 OPTIONS: dict[str, Any] = {"tactile": SEEN, "max_episode_steps": 6, "device": "cpu", "seed": 0}
 DOWN = torch.tensor([[0.0, 0.0, -1.0], [0.3, 0.0, -0.5], [0.0, 0.2, -1.0]])

@@ -37,6 +37,34 @@ def test_frames_are_timed_without_physics(tmp_path: Path, monkeypatch: pytest.Mo
         assert float(found[f"cpu.table.{part}frames_per_s"]) == pytest.approx(3 / call)
 
 
+@pytest.mark.timeout(1200)  # it compiles MuJoCo Warp for the CPU
+def test_environment_steps_on_the_device_are_timed_with_the_pads_pressed(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco_warp")
+    pytest.importorskip("torch")
+    bench.main(bench.Args(out=tmp_path, device="cpu", engine="mujoco_warp", envs=2, modes="touch", steps=3))
+    found = {name: float(value) for name, value in read_metrics(tmp_path / "metrics.json").items() if "push.touch" in name}
+    assert found["warp.push.touch.env_steps_per_s"] == pytest.approx(2e3 / found["warp.push.touch.ms_per_step"])
+    assert 0.5 <= found["warp.push.touch.pressed"] <= 1.0 and found["warp.push.touch.failed"] == 0.0
+
+
+def test_each_gpu_has_a_process_that_sees_no_other_and_speeds_add_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = tmp_path / "bench_rl.py"
+    monkeypatch.setattr(bench, "__file__", str(script))
+    script.write_text(
+        "import json, os, pathlib, sys\n"
+        "gpu = float(os.environ['CUDA_VISIBLE_DEVICES'])\n"
+        "out = pathlib.Path(sys.argv[sys.argv.index('--out') + 1]); out.mkdir(parents=True)\n"
+        "values = {'experiment': 'x', 'device': 'cuda', 'seed': 0, 'wall_s': 1.0, 'versions.x': '1',\n"
+        "          'gpu.push.fots.env_steps_per_s': 100.0 + gpu, 'gpu.push.fots.pressed': 0.5 + 0.1 * gpu}\n"
+        "(out / 'metrics.json').write_text(json.dumps(values))\n"
+    )
+    found = bench.timed_on_gpus("fots", bench.Args(gpus=3))
+    assert found == {"env_steps_per_s": 303.0, "least": 100.0, "most": 102.0, "pressed": 0.5, "gpus": 3}
+    script.write_text("raise SystemExit('broken on purpose')")
+    with pytest.raises(RaytacError, match="broken on purpose"):
+        bench.timed_on_gpus("fots", bench.Args(gpus=2))
+
+
 def test_bad_options_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     out = tmp_path / "out"
     options: dict[str, Any]
@@ -47,14 +75,21 @@ def test_bad_options_are_refused_before_anything_is_written(tmp_path: Path) -> N
     ):
         with pytest.raises(InputError, match=text):
             bench.main(bench.Args(out=out, device="cpu", **options))
-    for options, text in (({"task": "pull"}, "balance"), ({"steps": 0}, "1 or more"), ({"modalities": "smell"}, "markers")):
+    for options, text in (({"task": "pull"}, "InsertPeg"), ({"steps": 0}, "1 or more"), ({"modalities": "smell"}, "markers")):
         with pytest.raises(InputError, match=text):
             soak.main(soak.Args(out=out, device="cpu", **options))
     assert not out.exists()
 
 
 def test_a_soak_run_counts_and_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    options: dict[str, Any] = {"out": tmp_path, "device": "cpu", "envs": 2, "modalities": "wrench", "block": 4, "task": "roll"}
+    options: dict[str, Any] = {
+        "out": tmp_path,
+        "device": "cpu",
+        "envs": 2,
+        "modalities": "wrench",
+        "block": 4,
+        "task": "RollBall",
+    }
     with monkeypatch.context() as patch:
         write, calls = soak.store, []
 
@@ -70,8 +105,8 @@ def test_a_soak_run_counts_and_goes_on_where_it_was_stopped(tmp_path: Path, monk
     assert not (tmp_path / "metrics.json").exists()
     soak.main(soak.Args(steps=20, **options))
     found = read_metrics(tmp_path / "metrics.json")
-    assert found["roll.steps"] == 20 and found["roll.sittings"] == 2
-    assert found["roll.nonfinite"] == found["roll.failed"] == 0 and float(found["roll.memory_mb"]) > 50.0
+    assert found["RollBall.steps"] == 20 and found["RollBall.sittings"] == 2
+    assert found["RollBall.nonfinite"] == found["RollBall.failed"] == 0 and float(found["RollBall.memory_mb"]) > 50.0
     with pytest.raises(InputError, match="other settings"):
         soak.main(soak.Args(steps=20, **{**options, "envs": 3}))
 

@@ -13,6 +13,8 @@ from raytac import mount
 from raytac.errors import InputError, OverlapError
 from raytac.world import TactileWorld, Variation, WarpEngine, WorldState
 
+pytestmark = pytest.mark.timeout(1200)  # the first test compiles MuJoCo Warp for the CPU: minutes
+
 pytest.importorskip("mujoco_warp")
 
 FREE = """

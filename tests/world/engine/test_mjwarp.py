@@ -28,6 +28,8 @@ from tests.world.test_implicit_damping import plunger
 mujoco_warp = pytest.importorskip("mujoco_warp")
 from raytac.world.engine.mjwarp import MujocoWarp  # noqa: E402
 
+pytestmark = pytest.mark.timeout(1200)  # the first test compiles MuJoCo Warp for the CPU: minutes
+
 G, RADIUS = 9.81, 5e-3
 MASSES = 0.05, 0.02
 TOUCHES = {"ball": 0.3}

@@ -19,6 +19,8 @@ pytest.importorskip("mujoco_warp")
 from experiments.bench_gpu import PRESS, Args, Bench, joint_table, scene_of
 from raytac.world.warp_world import WarpWorld
 
+pytestmark = pytest.mark.timeout(1200)  # the first test compiles MuJoCo Warp for the CPU: minutes
+
 
 class Follow(BatchController):
     """Springs in the joints of all environments."""
