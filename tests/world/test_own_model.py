@@ -166,6 +166,43 @@ def test_a_geom_is_touched_in_its_true_shape_with_its_own_friction() -> None:
     assert volume == pytest.approx(0.02 * (0.04 * 0.01 + 0.012 * 0.02), rel=1e-5)
 
 
+ATTACHED = """<mujoco><option cone="elliptic"/><worldbody><body name="lamp" pos="1 0 0"><freejoint/>
+<geom size=".01" contype="0" conaffinity="0" mass=".1"/></body></worldbody></mujoco>"""
+"""A free body that nothing can touch."""
+
+
+def attached(collide: bool = False) -> mujoco.MjModel:
+    """A free body without geoms of its own, on which an object of another file stands a little aside and turned."""
+    ball = '<body name="ball" pos="0 0 .001"><geom name="shape" type="capsule" size=".005 .001" mass=".05"/></body>'
+    object_, spec = (
+        mujoco.MjSpec.from_string(f"<mujoco><worldbody>{ball}</worldbody></mujoco>"),
+        mujoco.MjSpec.from_string(ATTACHED),
+    )
+    thing = spec.worldbody.add_body(name="thing", pos=(0.001, 0.0, 0.004))
+    thing.add_freejoint()
+    spec.attach(object_, prefix="own_", frame=thing.add_frame(pos=(-0.001, 0.0, 0.0), euler=(90, 0, 0)))
+    mount(spec, "gelsight_mini_9x11", body="world", pose=np.eye(4), collide=collide)
+    return spec.compile()
+
+
+def test_an_object_that_was_attached_to_a_free_body_is_touched_with_it() -> None:
+    world = TactileWorld(attached(), outputs=("wrench",), control_timestep=0.02, num_envs=2)
+    assert list(world.composed.bodies) == ["thing"]
+    world.reset(variation=Variation(mass={"thing": np.array([1.0, 2.0])}))
+    for _ in range(40):
+        state = world.step()
+    np.testing.assert_allclose(state.wrench["sensor"][:, 2], [-0.05 * G, -0.1 * G], rtol=0.01)
+    named = TactileWorld(attached(), touches=["own_ball"], outputs=())
+    np.testing.assert_allclose(named.state().world_from_body["own_ball"][0, :3, 3], [0.0, -0.001, 0.004], atol=1e-12)
+    model = attached(collide=True)
+    data, readers = mujoco.MjData(model), [TactileReader(model, touches=[n], outputs=("height",)) for n in ("thing", "own_ball")]
+    for _ in range(400):
+        mujoco.mj_step(model, data)
+    one, other = (reader.read(data)["sensor"].surface for reader in readers)
+    assert one.indentation.max() > 1e-4
+    np.testing.assert_allclose(one.height, other.height, atol=1e-9)
+
+
 def test_a_mounting_error_moves_the_pad_and_no_site_of_the_robot(tmp_path: Path) -> None:
     shift = {"left": pose(np.eye(3), np.array([1e-3, 0.0, 0.0]))[None]}
     world = sensed(arm6())
@@ -217,7 +254,9 @@ SLEEP, NO_CONTACT = int(mujoco.mjtEnableBit.mjENBL_SLEEP), int(mujoco.mjtDisable
          {"touches": ["b"]}, "has no geom that collides: name the geoms"),
         (lambda: arm6("<body name='b' pos='0 0 1'><freejoint/><geom name='shell' type='mesh' mesh='open' mass='1'/></body>"),
          {}, r"touches = 'b': its geom 'shell' is a mesh that is not closed.*Mend the mesh"),
-        (lambda: arm6(""), {}, "the model has no body with a free joint"),
+        (lambda: arm6(""), {}, "the model has no body with a free joint and a geom that collides"),
+        (lambda: arm6("<body name='b' pos='0 0 1'><freejoint/><geom size='.01' contype='0' conaffinity='0'/></body>"),
+         {}, "the model has no body with a free joint and a geom that collides"),
         (arm6, {"sensors": ["middle"]}, r"sensors = 'middle': must be a sensor of the model.*left, right"),
         (arm6, {"control_timestep": 0.003}, r"control_timestep = 0.003: must be a whole multiple of the model's timestep of 0.002 s"),
         (arm6, {"keyframe": "home"}, r"keyframe = 'home': must be a keyframe of the model, which has none"),
