@@ -86,7 +86,8 @@ def test_a_keyframe_is_a_start_with_speeds_controls_and_mocap_bodies() -> None:
     qpos[0], qvel[0] = 0.5, 0.3
     key = spec.add_key(name="home", qpos=qpos, qvel=qvel, ctrl=np.arange(8.0) / 100, mpos=[0.1, 0.2, 0.3])
     assert key.name == "home"
-    world = sensed(spec, keyframe="home", touches=["ball", "hand"], num_envs=2)
+    with pytest.warns(RuntimeWarning, match=r"^'hand' moves as a mocap body"):
+        world = sensed(spec, keyframe="home", touches=["ball", "hand"], num_envs=2)
     for _ in range(3):
         world.step()
     placed = pose(np.eye(3), np.array([0.0, 0.5, 0.5]))
@@ -201,6 +202,31 @@ def test_an_object_that_was_attached_to_a_free_body_is_touched_with_it() -> None
     one, other = (reader.read(data)["sensor"].surface for reader in readers)
     assert one.indentation.max() > 1e-4
     np.testing.assert_allclose(one.height, other.height, atol=1e-9)
+
+
+DRAGGED = """<mujoco><option cone="elliptic"/><worldbody><geom type="plane" size="1 1 .1" friction=".05"/>
+<body name="mocap" mocap="true" pos="0 0 .05"/>
+<body name="hand" pos="0 0 .05" gravcomp="1"><freejoint/><geom size=".002" mass=".1" contype="0" conaffinity="0"/></body>
+<body name="block" pos="0 0 .01"><freejoint/><geom type="box" size=".02 .02 .01" mass=".05" friction=".05"/></body></worldbody>
+<equality><weld body1="mocap" body2="hand" solref=".004 1"/></equality></mujoco>"""
+
+
+def test_a_gel_welded_to_a_mocap_body_drags_and_one_that_is_fixed_to_it_is_warned_of() -> None:
+    def drag(data: mujoco.MjData, time: float) -> None:
+        data.mocap_pos[0] = 0.02 * np.clip((time - 0.2) / 0.3, 0.0, 1.0), 0.0, 0.05 - 0.0305 * min(time / 0.1, 1.0)
+
+    def mounted(body: str) -> mujoco.MjSpec:
+        spec = mujoco.MjSpec.from_string(DRAGGED)
+        mount(spec, "gelsight_mini", body=body, pose=np.diag([1.0, -1.0, -1.0, 1.0]), mass=0.1)
+        return spec
+
+    world = TactileWorld(mounted("hand"), touches=["block"], outputs=("wrench",), control_timestep=0.02)
+    for _ in range(25):
+        state = world.step(drag)
+    assert state.world_from_body["block"][0, 0, 3] == pytest.approx(0.02, abs=1e-3)
+    assert state.wrench["sensor"][0, 0] < -0.1 and state.wrench["sensor"][0, 2] < -1.0
+    with pytest.warns(RuntimeWarning, match=r"^'sensor' moves as a mocap body, which has no velocity.*welded to the mocap body"):
+        TactileWorld(mounted("mocap"), touches=["block"], outputs=())
 
 
 def test_a_mounting_error_moves_the_pad_and_no_site_of_the_robot(tmp_path: Path) -> None:
