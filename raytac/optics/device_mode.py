@@ -98,8 +98,10 @@ class DeviceMode(ABC):
         self._grid: PadGrid | None = None
         # One recording a batch size: a recording would replay at another size by scaling its launches, which is not what B means.
         self._frozen: dict[tuple[str, bool, int], Callable[..., Any]] = {}
-        self._at_rest: OpticsImages | None = None
-        """Images of one untouched pad, which every environment at rest shows."""
+        self._at_rest: dict[bool, OpticsImages] = {}
+        """Images of one untouched pad without and with dots, which every environment at rest shows."""
+        self._rest_ink: np.ndarray | None = None
+        """Dots (Ny, Nx) of that pad."""
         self._is_running = False
         """True if nobody has waited for the images that were begun last."""
         self._last: Callable[[], _Launched | None] = lambda: None
@@ -212,10 +214,13 @@ class DeviceMode(ABC):
             surface = replace(surface, height=surface.height.copy(), contact=surface.contact.copy(), ink=ink)
             heights, failed = self._checked(surface)
             pressed = self._pressed(surface, heights, failed)
-            whole = len(pressed) == surface.batch
-            if not whole and self._at_rest is None:
+            whole, dotted = len(pressed) == surface.batch, ink is not None
+            if not whole and dotted not in self._at_rest:
                 rest = GelSurface.at_rest(surface.grid)
-                self._at_rest = self._begun(rest, rest.height, np.zeros(1, bool))()
+                if dotted:
+                    assert self._rest_ink is not None
+                    rest = replace(rest, ink=self._rest_ink[None])
+                self._at_rest[dotted] = self._begun(rest, rest.height, np.zeros(1, bool))()
             begun = None
             if pressed:
                 rows = (surface, heights, failed) if whole else (surface.rows(pressed), heights[pressed], failed[pressed])
@@ -225,8 +230,7 @@ class DeviceMode(ABC):
             some = None if begun is None else begun()
             if whole and some is not None:
                 return some
-            assert self._at_rest is not None
-            return self._at_rest.repeated(surface.batch, pressed, some)
+            return self._at_rest[dotted].repeated(surface.batch, pressed, some)
 
         result = _Launched(images, partial(self.render, surface))
         self._last, self._is_running = ref(result), begun is not None
@@ -239,11 +243,13 @@ class DeviceMode(ABC):
             dr.sync_thread()
 
     def _pressed(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> list[int]:
-        """Environments to render: a power of two, the others are at rest; all if dots may differ."""
-        if surface.ink is not None:
-            return list(range(surface.batch))
+        """Environments to render: a power of two, the others are at rest, their dots where the first pad at rest had them."""
         rest = surface.grid.rest.astype(np.float32)
         differ = failed | surface.contact.any(axis=(1, 2)) | (heights != rest).any(axis=(1, 2))
+        if surface.ink is not None and not differ.all():
+            if self._rest_ink is None:
+                self._rest_ink = surface.ink[int(np.argmin(differ))].copy()
+            differ |= (surface.ink != self._rest_ink).any(axis=(1, 2))
         pressed = np.flatnonzero(differ).tolist()
         rounded = rounded_envs(pressed, surface.batch) if pressed else []
         return rounded if len(rounded) < surface.batch else list(range(surface.batch))

@@ -96,7 +96,7 @@ class WorldSession:
     def _geoms(self) -> Iterator[Solid]:
         model = self._world.model
         gels = {int(model.geom(mounted.gel).id) for mounted in self._world.composed.sensors}
-        objects = {body.index for body in self._world.composed.bodies.values()}
+        objects = {member for body in self._world.composed.bodies.values() for member in body.members}
         for geom in range(model.ngeom):
             red, green, blue, alpha = (float(v) for v in model.geom_rgba[geom])
             if geom in gels or int(model.geom_group[geom]) >= _SHOWN_GROUPS or alpha == 0.0:

@@ -125,11 +125,11 @@ class EnvironmentModels:
             self.friction_on_gel[b] = self._scene_friction
             self.gel_stiffness[b], self.gel_friction[b] = 1.0, self._scene_gel_friction
             for i, body in enumerate(self._bodies):
-                name, index = body.name, body.index
+                name, members = body.name, list(body.members)
                 if name in variation.mass:
                     factor = float(variation.mass[name][row])
-                    model.body_mass[index] *= factor
-                    model.body_inertia[index] *= factor
+                    model.body_mass[members] *= factor
+                    model.body_inertia[members] *= factor
                 if name in variation.friction:
                     factor = float(variation.friction[name][row])
                     self.friction_on_gel[b, i] *= factor

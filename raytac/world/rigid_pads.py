@@ -4,10 +4,11 @@ MuJoCo's own collision uses a convex hull of the body, and its number of contact
 ``RigidPad``, from the overlap of the resting gel with the body's underside (``PadSearch``):
 
 - place and normal: the overlap's centroid, and the resting gel's normal there. Its line goes through the centre of a ball anywhere on the
-dome; - normal force: the load law of this body at this place, as an implicit spring (``normal_spring``); - friction: the gel shears first
-and slips from the edge of the contact inwards (``ShearState``), within Coulomb's cone; torsional 3π/16 μ a with a the contact's radius
-(Hertz contact that slips as a whole, as in a press); rolling 3/16 α a (J. A. Greenwood, H. Minshall, D. Tabor, Hysteresis losses in
-rolling and sliding friction, Proc. R. Soc. A 259, 1961) with α the gel's hysteresis.
+  dome;
+- normal force: the load law of this body at this place, as an implicit spring (``normal_spring``);
+- friction: the gel shears first and slips from the edge of the contact inwards (``ShearState``), within Coulomb's cone; torsional
+  3π/16 μ a with a the contact's radius (Hertz contact that slips as a whole, as in a press); rolling 3/16 α a (J. A. Greenwood,
+  H. Minshall, D. Tabor, Hysteresis losses in rolling and sliding friction, Proc. R. Soc. A 259, 1961) with α the gel's hysteresis.
 
 What a step does before its contact is known is foreseen: controls are written before contacts are put in, and MuJoCo's acceleration
 without constraints says which gap may close, and which slide begin, within the step.

@@ -95,6 +95,9 @@ class TactileReader:
         self._body_index = np.array([body.index for body in bodies], int)
         # Entries of one body move together: MuJoCo's force is on the body.
         self._groups = {int(index): np.flatnonzero(self._body_index == index) for index in np.unique(self._body_index)}
+        self._group_of = {
+            member: group for group, entries in enumerate(self._groups.values()) for member in bodies[entries[0]].members
+        }
         self._search = {
             mounted.name: PadSearch(
                 [mounted.spec.gelpad],
@@ -140,8 +143,8 @@ class TactileReader:
         self, mounted: MountedSensor, datas: Sequence[mujoco.MjData], world_from_pad: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Wrench (B, 6) of all contacts on the gel, pad frame, and the normal loads (B, groups) [N]."""
-        gel, groups = int(self.model.geom(mounted.gel).id), list(self._groups)
-        wrench, load, local = np.zeros((len(datas), 6)), np.zeros((len(datas), len(groups))), np.zeros(6)
+        gel, groups = int(self.model.geom(mounted.gel).id), len(self._groups)
+        wrench, load, local = np.zeros((len(datas), 6)), np.zeros((len(datas), groups)), np.zeros(6)
         for b, data in enumerate(datas):
             if not data.ncon:
                 continue
@@ -157,9 +160,9 @@ class TactileReader:
                 torque = torque + np.cross(contact.pos - origin, force)
                 on_pad = np.concatenate([force @ rotation, torque @ rotation])
                 wrench[b] += on_pad
-                body = int(self.model.geom_bodyid[geoms[k, 1 if first else 0]])
-                if body in self._groups:
-                    load[b, groups.index(body)] -= on_pad[2]
+                group = self._group_of.get(int(self.model.geom_bodyid[geoms[k, 1 if first else 0]]))
+                if group is not None:
+                    load[b, group] -= on_pad[2]
         return wrench, load
 
     def _settle(self, mounted: MountedSensor, pad_from_body: np.ndarray, load: np.ndarray, failed: np.ndarray) -> None:

@@ -12,6 +12,7 @@ from raytac.checks import check_number
 from raytac.errors import InputError
 from raytac.physics.geoms import geom_part
 from raytac.robots.mount import MountedSensor
+from raytac.se3 import pose_of
 from raytac.shapes.part import Part, mesh_part
 
 TouchChoice = Sequence[str] | Mapping[str, float | None]
@@ -31,6 +32,8 @@ class TouchedBody:
     """Coulomb coefficient against gel; None: the gel's own."""
     geoms: tuple[int, ...]
     """Geoms of the model that have this shape."""
+    members: tuple[int, ...]
+    """The body and those that are fixed to it, which move as one."""
     qpos: int
     """Address of its free joint's seven positions, else −1."""
     mocap: int = -1
@@ -55,8 +58,9 @@ class TouchedBody:
     def of(
         cls, model: mujoco.MjModel, name: str, index: int, parts: tuple[Part, ...], friction: float | None, geoms: Sequence[int]
     ) -> TouchedBody:
-        """The body of that index, with the joint that it has."""
-        return cls(name, index, parts, friction, tuple(geoms), _free_joint(model, index), int(model.body_mocapid[index]))
+        """The body of that index, with the joint and the fixed bodies that it has."""
+        members = tuple(fixed_bodies(model, index))
+        return cls(name, index, parts, friction, tuple(geoms), members, _free_joint(model, index), int(model.body_mocapid[index]))
 
 
 def touched_bodies(
@@ -64,11 +68,12 @@ def touched_bodies(
 ) -> tuple[TouchedBody, ...]:
     """Bodies of a compiled model that pads touch.
 
-    A body is sensed by its geoms that collide in MuJoCo, so that pads and the rest of the model meet the same shape; a mesh keeps its own
-    triangles. A name that no body has is that of one geom, which may be one that is only looked at, as the finer shape often is.
+    A body is sensed by its geoms that collide in MuJoCo, so that pads and the rest of the model meet the same shape, with those of bodies
+    that are fixed to it; a mesh keeps its own triangles. A name that no body has is that of one geom, which may be one that is only looked
+    at, as the finer shape often is.
 
     Args:
-        touches: names of bodies or geoms; None is every body with a free joint that carries no sensor.
+        touches: names of bodies or geoms; None is every body with a free joint that has a geom that collides and carries no sensor.
 
     Raises:
         InputError: a name that no body and no geom has or that comes twice, a body that is part of a sensor or fixed to it, no geom that
@@ -77,9 +82,9 @@ def touched_bodies(
     carried = [int(model.body(sensor.body).id) for sensor in sensors]
     if touches is None:
         carriers = {ancestor for body in carried for ancestor in _ancestors(model, body)}
-        free = [b for b in range(1, model.nbody) if _free_joint(model, b) >= 0 and b not in carriers]
+        free = [b for b in range(1, model.nbody) if _free_joint(model, b) >= 0 and b not in carriers and _colliding(model, b)]
         if not free:
-            rule = "must name what the pads touch: the model has no body with a free joint"
+            rule = "must name what the pads touch: the model has no body with a free joint and a geom that collides"
             raise InputError("touches", value=None, rule=rule, choices=_names(model, "BODY"))
         return tuple(_touched(model, model.body(b).name or f"body{b}", b, None) for b in free)
     if isinstance(touches, str) or not isinstance(touches, (Sequence, Mapping)):
@@ -106,18 +111,39 @@ def touched_bodies(
 
 
 def _touched(model: mujoco.MjModel, name: str, body: int, geom: int | None) -> TouchedBody:
-    first = int(model.body_geomadr[body])
-    own = range(first, first + int(model.body_geomnum[body]))
-    geoms = [g for g in own if model.geom_contype[g] or model.geom_conaffinity[g]] if geom is None else [geom]
+    geoms = _colliding(model, body) if geom is None else [geom]
     if not geoms:
+        own = _geoms(model, body)
         there = [model.geom(g).name for g in own if model.geom(g).name]
-        rule = "has no geom that collides: name the geoms that are its shape" if len(own) else "has no geom"
+        rule = "has no geom that collides: name the geoms that are its shape" if own else "has no geom"
         raise InputError("touches", value=name, rule=rule, choices=there)
-    parts = tuple(_solid(name, model.geom(g).name or f"geom{g}", geom_part(model, g)) for g in geoms)
+    parts = tuple(_in_body(model, body, g, _solid(name, model.geom(g).name or f"geom{g}", geom_part(model, g))) for g in geoms)
     if len(parts) > 1 and any(part.kind == "plane" for part in parts):
         named = [model.geom(g).name for g in geoms if model.geom(g).name]
         raise InputError("touches", value=name, rule="has a half-space among other geoms: name the geoms", choices=named)
     return TouchedBody.of(model, name, body, parts, None, geoms)
+
+
+def fixed_bodies(model: mujoco.MjModel, body: int) -> list[int]:
+    """A body and all below it that no joint moves against it; of the world the world alone."""
+    below = [b for b in range(body + 1, model.nbody) if body and model.body_weldid[b] == model.body_weldid[body]]
+    return [body, *(b for b in below if body in _ancestors(model, b))]
+
+
+def _geoms(model: mujoco.MjModel, body: int) -> list[int]:
+    return np.flatnonzero(np.isin(model.geom_bodyid, fixed_bodies(model, body))).tolist()
+
+
+def _colliding(model: mujoco.MjModel, body: int) -> list[int]:
+    return [g for g in _geoms(model, body) if model.geom_contype[g] or model.geom_conaffinity[g]]
+
+
+def _in_body(model: mujoco.MjModel, body: int, geom: int, part: Part) -> Part:
+    """The part in the frame of ``body``, which its geom's body is or is fixed to."""
+    pose, at = part.object_from_part, int(model.geom_bodyid[geom])
+    while at != body:
+        pose, at = pose_of(model.body_pos[at], model.body_quat[at]) @ pose, int(model.body_parentid[at])
+    return part if pose is part.object_from_part else replace(part, object_from_part=pose)
 
 
 def _solid(name: str, geom: str, part: Part) -> Part:

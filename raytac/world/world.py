@@ -105,7 +105,8 @@ class TactileWorld:
             sensors: names of sensors, results of ``mount``, or a mapping of names to sensors, which a model needs whose sensors were
                 mounted as specifications; None is every sensor that the model says it has.
             touches: names of bodies that pads touch, or of single geoms; a mapping has their friction coefficients against gel. None is
-                every body with a free joint. Of a body the geoms that collide in MuJoCo are sensed; meshes as they are, not their hulls.
+                every body with a free joint and a geom that collides. Of a body, and of what is fixed to it, the geoms that collide in
+                MuJoCo are sensed; meshes as they are, not their hulls.
             control_timestep: of one ``step`` [s], a whole multiple of the model's timestep; None is one timestep.
             keyframe: name of the keyframe that is the start; None is ``qpos0``.
             allow_overlap: names of geoms in which a gel may lie at the start.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -103,6 +104,8 @@ def own_world_model(
             control step that is no multiple, an unknown keyframe, or a gel that lies deeper than 0.1 mm in another geom that collides (by
             MuJoCo's distance, of convex hulls).
         SpecError: a sensor's file is missing or wrong.
+
+    With ``own_contact`` a ``RuntimeWarning`` names what moves as a mocap body.
     """
     if not isinstance(model, mujoco.MjModel):
         rule = "must be a mujoco.MjModel, of which the states are: model = spec.compile()"
@@ -112,6 +115,8 @@ def own_world_model(
         _check_options(model)
     _check_collisions(model, mounted, own_contact)
     touched, timestep = touched_bodies(model, touches, mounted), float(model.opt.timestep)
+    if own_contact:
+        _warn_of_mocap(model, mounted, touched)
     if control_timestep is None:
         control_timestep = timestep
     steps = check_number("control_timestep", control_timestep, "(0, 1]", "s") / timestep
@@ -164,6 +169,19 @@ def _check_collisions(model: mujoco.MjModel, sensors: Sequence[MountedSensor], o
         if not collides and not own_contact:
             rule = "must collide in MuJoCo, whose forces are read: mount the sensor with collide=True"
             raise InputError("gel", value=mounted.gel, rule=rule)
+
+
+def _warn_of_mocap(model: mujoco.MjModel, sensors: Sequence[MountedSensor], touched: Sequence[TouchedBody]) -> None:
+    """Warn of what is fixed to a mocap body, whose motion MuJoCo's contacts do not know."""
+    bodies = {mounted.name: int(model.body(mounted.body).id) for mounted in sensors} | {body.name: body.index for body in touched}
+    names = [name for name, body in bodies.items() if model.body_mocapid[model.body_weldid[body]] >= 0]
+    if names:
+        warnings.warn(
+            f"{', '.join(map(repr, names))} moves as a mocap body, which has no velocity in MuJoCo: friction of a gel does not drag, and "
+            "there is no force against what stands still. Give it a body with a free joint, welded to the mocap body",
+            RuntimeWarning,
+            stacklevel=4,
+        )
 
 
 def checked_states(

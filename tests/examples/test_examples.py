@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 SAYS = {
     "batch": "load",
+    "foreign_env": "right: pad pressed by 3.0",
     "foreign_loop": "the ball weighs 0.98",
     "gym_env": "return after five random actions",
     "own_mujoco_model": "right: normal force",
@@ -36,7 +37,7 @@ def test_an_example_fits_on_a_screen_and_says_how_to_run_it(path: Path) -> None:
 
 @pytest.mark.parametrize("name", sorted(SAYS))
 def test_an_example_runs(name: str, tmp_path: Path) -> None:
-    if name in ("gym_env", "own_vector_env"):
+    if name in ("foreign_env", "gym_env", "own_vector_env"):
         pytest.importorskip("gymnasium")
     command = [sys.executable, str(ROOT / "examples" / f"{name}.py")]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}

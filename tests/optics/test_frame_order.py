@@ -154,6 +154,18 @@ def test_batches_of_which_some_are_at_rest(mode: str, device: str, fresh: Callab
         assert_same(found, {name: np.concatenate([s[name] for s in singles]) for name in singles[0]}, str(batch))
 
 
+@pytest.mark.parametrize("mode", ["fast-direct", "phong"])
+def test_pads_at_rest_with_dots_are_rendered_once_and_again_where_dots_moved(mode: str) -> None:
+    one = MODES[mode]("cpu")
+    surface = stacked(REST, REST, PRESS, REST, ink=True)
+    assert surface.ink is not None
+    surface.ink[3] = np.roll(surface.ink[3], 3, axis=1)
+    known = arrays(one, surface)
+    assert (known["rgb"][0] != known["rgb"][3]).any() and len(one._pressed(surface, *one._checked(surface))) == 2
+    assert_same(arrays(one, stacked(REST, ink=True)), {name: values[:1] for name, values in known.items()}, "alone")
+    assert (arrays(one, stacked(REST))["rgb"] != known["rgb"][:1]).any()  # without dots
+
+
 @pytest.mark.parametrize(
     ("mode", "ink"),
     [

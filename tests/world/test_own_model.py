@@ -86,7 +86,8 @@ def test_a_keyframe_is_a_start_with_speeds_controls_and_mocap_bodies() -> None:
     qpos[0], qvel[0] = 0.5, 0.3
     key = spec.add_key(name="home", qpos=qpos, qvel=qvel, ctrl=np.arange(8.0) / 100, mpos=[0.1, 0.2, 0.3])
     assert key.name == "home"
-    world = sensed(spec, keyframe="home", touches=["ball", "hand"], num_envs=2)
+    with pytest.warns(RuntimeWarning, match=r"^'hand' moves as a mocap body"):
+        world = sensed(spec, keyframe="home", touches=["ball", "hand"], num_envs=2)
     for _ in range(3):
         world.step()
     placed = pose(np.eye(3), np.array([0.0, 0.5, 0.5]))
@@ -166,6 +167,68 @@ def test_a_geom_is_touched_in_its_true_shape_with_its_own_friction() -> None:
     assert volume == pytest.approx(0.02 * (0.04 * 0.01 + 0.012 * 0.02), rel=1e-5)
 
 
+ATTACHED = """<mujoco><option cone="elliptic"/><worldbody><body name="lamp" pos="1 0 0"><freejoint/>
+<geom size=".01" contype="0" conaffinity="0" mass=".1"/></body></worldbody></mujoco>"""
+"""A free body that nothing can touch."""
+
+
+def attached(collide: bool = False) -> mujoco.MjModel:
+    """A free body without geoms of its own, on which an object of another file stands a little aside and turned."""
+    ball = '<body name="ball" pos="0 0 .001"><geom name="shape" type="capsule" size=".005 .001" mass=".05"/></body>'
+    object_, spec = (
+        mujoco.MjSpec.from_string(f"<mujoco><worldbody>{ball}</worldbody></mujoco>"),
+        mujoco.MjSpec.from_string(ATTACHED),
+    )
+    thing = spec.worldbody.add_body(name="thing", pos=(0.001, 0.0, 0.004))
+    thing.add_freejoint()
+    spec.attach(object_, prefix="own_", frame=thing.add_frame(pos=(-0.001, 0.0, 0.0), euler=(90, 0, 0)))
+    mount(spec, "gelsight_mini_9x11", body="world", pose=np.eye(4), collide=collide)
+    return spec.compile()
+
+
+def test_an_object_that_was_attached_to_a_free_body_is_touched_with_it() -> None:
+    world = TactileWorld(attached(), outputs=("wrench",), control_timestep=0.02, num_envs=2)
+    assert list(world.composed.bodies) == ["thing"]
+    world.reset(variation=Variation(mass={"thing": np.array([1.0, 2.0])}))
+    for _ in range(40):
+        state = world.step()
+    np.testing.assert_allclose(state.wrench["sensor"][:, 2], [-0.05 * G, -0.1 * G], rtol=0.01)
+    named = TactileWorld(attached(), touches=["own_ball"], outputs=())
+    np.testing.assert_allclose(named.state().world_from_body["own_ball"][0, :3, 3], [0.0, -0.001, 0.004], atol=1e-12)
+    model = attached(collide=True)
+    data, readers = mujoco.MjData(model), [TactileReader(model, touches=[n], outputs=("height",)) for n in ("thing", "own_ball")]
+    for _ in range(400):
+        mujoco.mj_step(model, data)
+    one, other = (reader.read(data)["sensor"].surface for reader in readers)
+    assert one.indentation.max() > 1e-4
+    np.testing.assert_allclose(one.height, other.height, atol=1e-9)
+
+
+DRAGGED = """<mujoco><option cone="elliptic"/><worldbody><geom type="plane" size="1 1 .1" friction=".05"/>
+<body name="mocap" mocap="true" pos="0 0 .05"/>
+<body name="hand" pos="0 0 .05" gravcomp="1"><freejoint/><geom size=".002" mass=".1" contype="0" conaffinity="0"/></body>
+<body name="block" pos="0 0 .01"><freejoint/><geom type="box" size=".02 .02 .01" mass=".05" friction=".05"/></body></worldbody>
+<equality><weld body1="mocap" body2="hand" solref=".004 1"/></equality></mujoco>"""
+
+
+def test_a_gel_welded_to_a_mocap_body_drags_and_one_that_is_fixed_to_it_is_warned_of() -> None:
+    def drag(data: mujoco.MjData, time: float) -> None:
+        data.mocap_pos[0] = 0.02 * np.clip((time - 0.2) / 0.3, 0.0, 1.0), 0.0, 0.05 - 0.0305 * min(time / 0.1, 1.0)
+
+    def mounted(body: str) -> mujoco.MjSpec:
+        spec = mujoco.MjSpec.from_string(DRAGGED)
+        mount(spec, "gelsight_mini", body=body, pose=np.diag([1.0, -1.0, -1.0, 1.0]), mass=0.1)
+        return spec
+
+    world = TactileWorld(mounted("hand"), touches=["block"], outputs=("wrench",), control_timestep=0.02)
+    for _ in range(25):
+        state = world.step(drag)
+    assert state.world_from_body["block"][0, 0, 3] == pytest.approx(0.02, abs=1e-3)
+    assert state.wrench["sensor"][0, 0] < -0.1 and state.wrench["sensor"][0, 2] < -1.0
+    with pytest.warns(RuntimeWarning, match=r"^'sensor' moves as a mocap body, which has no velocity.*welded to the mocap body"):
+        TactileWorld(mounted("mocap"), touches=["block"], outputs=())
+
+
 def test_a_mounting_error_moves_the_pad_and_no_site_of_the_robot(tmp_path: Path) -> None:
     shift = {"left": pose(np.eye(3), np.array([1e-3, 0.0, 0.0]))[None]}
     world = sensed(arm6())
@@ -217,7 +280,9 @@ SLEEP, NO_CONTACT = int(mujoco.mjtEnableBit.mjENBL_SLEEP), int(mujoco.mjtDisable
          {"touches": ["b"]}, "has no geom that collides: name the geoms"),
         (lambda: arm6("<body name='b' pos='0 0 1'><freejoint/><geom name='shell' type='mesh' mesh='open' mass='1'/></body>"),
          {}, r"touches = 'b': its geom 'shell' is a mesh that is not closed.*Mend the mesh"),
-        (lambda: arm6(""), {}, "the model has no body with a free joint"),
+        (lambda: arm6(""), {}, "the model has no body with a free joint and a geom that collides"),
+        (lambda: arm6("<body name='b' pos='0 0 1'><freejoint/><geom size='.01' contype='0' conaffinity='0'/></body>"),
+         {}, "the model has no body with a free joint and a geom that collides"),
         (arm6, {"sensors": ["middle"]}, r"sensors = 'middle': must be a sensor of the model.*left, right"),
         (arm6, {"control_timestep": 0.003}, r"control_timestep = 0.003: must be a whole multiple of the model's timestep of 0.002 s"),
         (arm6, {"keyframe": "home"}, r"keyframe = 'home': must be a keyframe of the model, which has none"),

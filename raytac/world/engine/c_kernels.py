@@ -29,6 +29,8 @@ _BESIDE = wp.constant(wp.float64(1e-4))
 """Distance from a box from which a point of a gap is not on it [m]."""
 _OPEN = wp.constant(wp.float64(2e-5))
 """Gap [m] of a contact without friction before and after a step; load closes it nearer."""
+_SLIPPERY = wp.constant(wp.float64(1e-5))
+"""Factor of the friction across a gap that stays open; of all coefficients and the cone, so that they fit each other."""
 _FAR = wp.constant(wp.float64(1.0))
 """Gap that no step closes [m]."""
 _SLOWEST = wp.constant(wp.float64(1e-9))
@@ -317,11 +319,10 @@ def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(
             # A gap is closed by the step exactly, and a penetration is taken back slowly.
             wanted = wp.where(gap > _0, gap, _BACK * gap) / step
             open = wp.bool(False)
-            ahead, free = wp.vec3d(), wp.vec3d()
+            ahead = wp.vec3d()
             if gap > _0:
                 for m in range(3):
-                    free[m] = row_times(memory, env, first + m, smooth)
-                    ahead[m] = velocity[first + m] + step * free[m]
+                    ahead[m] = velocity[first + m] + step * row_times(memory, env, first + m, smooth)
                 open = gap > _OPEN and gap + step * ahead[0] > _OPEN
                 if is_box(boxes, one) and is_box(boxes, two):
                     at = n + memory.frame
@@ -333,8 +334,12 @@ def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(
                         wanted, open = _FAR / step, wp.bool(True)
             reference[first] = -(velocity[first] + wanted) / step
             for m in range(1, 3):
+                reference[first + m] = -velocity[first + m] / step
+            if open:
                 # MuJoCo's cone acts across a gap that is smaller than the friction times the slide of the step.
-                reference[first + m] = wp.where(open, free[m], -velocity[first + m] / step)
+                contact[n + memory.mu] *= _SLIPPERY
+                for m in range(_ROWS - 1):
+                    contact[n + memory.friction + m] *= _SLIPPERY
     row = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
     for pad in range(slots.held.shape[1]):
         for body in range(slots.held.shape[2]):

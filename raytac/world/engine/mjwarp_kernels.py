@@ -34,6 +34,8 @@ _BESIDE = wp.constant(wp.float32(1e-4))
 """Distance from a box from which a point of a gap is not on it [m]."""
 _OPEN = wp.constant(wp.float32(2e-5))
 """Gap [m] of a contact without friction before and after a step; load closes it nearer."""
+_SLIPPERY = wp.constant(wp.float32(1e-5))
+"""Factor of the friction across a gap that stays open."""
 _FAR = wp.constant(wp.float32(1.0))
 """Gap that no step closes [m]."""
 _SLOWEST = wp.constant(wp.float32(1e-6))
@@ -418,13 +420,12 @@ def write_hard_references(
     # A gap is closed by the step exactly, and a penetration is taken back slowly.
     wanted = wp.where(gap > wp.float32(0.0), gap, _BACK * gap) / step
     open = wp.bool(False)
-    ahead, free = wp.vec3(), wp.vec3()
+    ahead = wp.vec3()
     if gap > wp.float32(0.0):
         for m in range(3):
             other = worlds.efc_address[k, m]
             if other >= 0:
-                free[m] = wp.float32(row_times(worlds, i, other, worlds.qacc_smooth))
-                ahead[m] = worlds.vel[i, other] + step * free[m]
+                ahead[m] = worlds.vel[i, other] + step * wp.float32(row_times(worlds, i, other, worlds.qacc_smooth))
         open = gap > _OPEN and gap + step * ahead[0] > _OPEN
         if is_box(boxes, geom[0]) and is_box(boxes, geom[1]):
             frame = worlds.frame[k]
@@ -437,8 +438,10 @@ def write_hard_references(
     for m in range(1, 3):
         other = worlds.efc_address[k, m]
         if other >= 0:
-            # MuJoCo's cone acts across a gap that is smaller than the friction times the slide of the step.
-            worlds.aref[i, other] = wp.where(open, free[m], -worlds.vel[i, other] / step)
+            worlds.aref[i, other] = -worlds.vel[i, other] / step
+    if open:
+        # MuJoCo's cone acts across a gap that is smaller than the friction times the slide of the step.
+        worlds.friction[k] = _SLIPPERY * worlds.friction[k]
 
 
 @wp.kernel
