@@ -36,9 +36,9 @@ _SPRINGS = ("joints", "speed", "bias", "mass")
 
 
 class WarpWorld:
-    """B environments of a model with rigid pads; arms with torque motors follow targets by springs.
+    """B environments of a model with rigid pads on MuJoCo Warp.
 
-    The springs obey the law of ``JointImpedance``.
+    Arms with torque motors follow targets by springs, which obey the law of ``JointImpedance``.
 
     A control step is launched without waiting for the device, on CUDA as one graph. An environment in which physics breaks down, or a
     body goes through a pad, is no longer active until it is reset.

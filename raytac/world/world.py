@@ -218,7 +218,10 @@ class TactileWorld:
 
     @property
     def data(self) -> tuple[mujoco.MjData, ...]:
-        """MuJoCo's state in every environment; raises ``InputError`` with MuJoCo Warp, whose states lie on a device."""
+        """MuJoCo's state in every environment.
+
+        Raises ``InputError`` with MuJoCo Warp, whose states lie on a device.
+        """
         return self._states.data
 
     @property
@@ -365,10 +368,10 @@ class TactileWorld:
             self._states.fail(failed)
 
     def read(self, name: str) -> WarpFrame:
-        """Readings of one sensor after the last step or reset, with MuJoCo Warp: arrays on the device.
+        """Readings of one sensor with MuJoCo Warp: arrays on the device.
 
-        Nothing is copied. The height is there if ``outputs`` or markers ask for it. Another gel that presses is not in it, as it is in
-        the frames of ``observe``.
+        They are those after the last step or reset, and nothing is copied. The height is there if ``outputs`` or markers ask for it.
+        Another gel that presses is not in it, as it is in the frames of ``observe``.
 
         Raises ``InputError`` for an unknown sensor, or with C MuJoCo.
         """
