@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Unpack
 
 from raytac.checks import check_kind, check_known, check_methods
 from raytac.device import resolve_device
@@ -12,6 +12,7 @@ from raytac.specs.press import PADS, PressScene
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
+    from raytac.physics.press import PressSettings
     from raytac.physics.rigid.pad import RigidPad
     from raytac.physics.soft.mesh import PadMesh
     from raytac.physics.soft.pad import SoftPad
@@ -27,7 +28,7 @@ class Rigid:
     def label(self) -> str:
         return "rigid"
 
-    def build(self, spec: SensorSpec, press: PressScene, *, device: str = "auto", **settings: Any) -> RigidPad:
+    def build(self, spec: SensorSpec, press: PressScene, *, device: str = "auto", **settings: Unpack[PressSettings]) -> RigidPad:
         """The pad of a press; always on the CPU. See ``PhysicsConfig.build``."""
         from raytac.physics.rigid.pad import RigidPad
 
@@ -63,7 +64,7 @@ class Ipc:
         level = self.level or PADS[0]
         return f"ipc-{level if isinstance(level, str) else 'own'}"
 
-    def build(self, spec: SensorSpec, press: PressScene, *, device: str = "auto", **settings: Any) -> SoftPad:
+    def build(self, spec: SensorSpec, press: PressScene, *, device: str = "auto", **settings: Unpack[PressSettings]) -> SoftPad:
         """The pad of a press, as ``PhysicsConfig.build``; no ray is traced: CUDA needs no OptiX."""
         from raytac.physics.soft.pad import SoftPad
 

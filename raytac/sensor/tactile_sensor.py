@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -23,12 +23,18 @@ from raytac.markers.registry import MARKERS
 from raytac.markers.tracker import MarkerFrame, MarkerTracker
 from raytac.optics.base import OPTICAL_OUTPUTS, BuiltOptics, OpticalMode, OpticsConfig, OpticsImages, start
 from raytac.optics.registry import chosen_optics
-from raytac.physics.base import Pad, PadReading, PhysicsConfig
+from raytac.physics.base import Pad, PadReading, PhysicsConfig, TargetArrays
 from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
 from raytac.physics.soft.contact_width import cells_across, holds_force, warn_if_narrow
 from raytac.sensor.options import checked_markers, checked_outputs, checked_resolution, press_scene, warn_of_other_shape
 from raytac.specs import PressScene, SensorSpec, press_of, validate_press
 from raytac.specs.sensor_file import sensor_spec
+
+
+class EnvironmentTargets(TargetArrays, total=False):
+    """Targets and seeds of the B environments of a press, as ``TactileSensor.load`` says."""
+
+    seeds: Sequence[int] | None
 
 
 class TactileSensor:
@@ -50,7 +56,7 @@ class TactileSensor:
     """(width, height) of every image [px]."""
     grid: PadGrid
     """Nodes of the pad's surface."""
-    optics: OpticsConfig[Any]
+    optics: OpticsConfig[OpticalMode]
     """Configuration of the optical mode."""
     pitch: float
     """Spacing of the nodes that was asked for [m]; ``grid`` fits it to the pad."""
@@ -64,7 +70,7 @@ class TactileSensor:
         sensor: str | Path | SensorSpec = "gelsight_mini",
         *,
         physics: str | PhysicsConfig | None = None,
-        optics: str | OpticsConfig[Any] | OpticalMode = "raytrace",
+        optics: str | OpticsConfig[OpticalMode] | OpticalMode = "raytrace",
         outputs: Sequence[str] | str = ("rgb",),
         resolution: tuple[int, int] | str | None = None,
         device: str = "auto",
@@ -171,7 +177,7 @@ class TactileSensor:
         scale: float | None = None,
         pitch: float | None = None,
         progress: bool = False,
-        **own: Any,
+        **own: Unpack[EnvironmentTargets],
     ) -> TactileFrame:
         """Run the scene's trajectory; frame at its peak: the end of the last stage but a release.
 

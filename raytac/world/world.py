@@ -36,7 +36,7 @@ from raytac.world.world_state import Control, WorldState
 
 if TYPE_CHECKING:
     from raytac.markers import MarkersConfig
-    from raytac.optics.base import OpticsConfig
+    from raytac.optics.base import OpticalMode, OpticsConfig
     from raytac.physics.soft.scene import SoftScene
     from raytac.robots.mount import SensorChoice
     from raytac.world.touched import TouchChoice
@@ -87,7 +87,7 @@ class TactileWorld:
         coupling: str | None = None,
         outputs: Sequence[str] | str = ("rgb", "wrench"),
         markers: str | MarkersConfig | None = None,
-        optics: str | OpticsConfig[Any] = "raytrace",
+        optics: str | OpticsConfig[OpticalMode] = "raytrace",
         resolution: tuple[int, int] | str | None = None,
         num_envs: int = 1,
         engine: str | WarpEngine = "mujoco",
@@ -185,7 +185,7 @@ class TactileWorld:
         if isinstance(self.engine, WarpEngine):
             from raytac.world.warp_states import WarpStates
 
-            felt = "height" in self._frames.outputs or markers is not None
+            felt = "height" in ((outputs,) if isinstance(outputs, str) else outputs) or markers is not None
             grids = {one: sensor.grid for one, sensor in self._frames.sensors.items()} if felt else {}
             model = None if markers is None else markers_config(markers)
             self._states: CStates | WarpStates = WarpStates(
