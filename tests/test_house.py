@@ -77,6 +77,7 @@ def test_files_of_a_toy_optical_mode(root: Path) -> None:
         house.measure(root)
 
 
+@pytest.mark.script
 def test_the_library_keeps_its_order() -> None:
     """Bounds of the second plan; docstrings and words have tests of their own (``tests/test_words.py``)."""
     counts, details = house.measure(Path(__file__).parents[1])

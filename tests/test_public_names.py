@@ -54,6 +54,7 @@ def keywords(function: Callable[..., object], *others: str) -> set[str]:
     return {one.name for one in parameters if one.kind is one.KEYWORD_ONLY} - set(others)
 
 
+@pytest.mark.solver
 def test_typed_keyword_arguments_are_those_that_are_passed_on() -> None:
     """Names that type checkers know for ``**own``, ``**settings`` and ``**options`` of public functions."""
     from raytac.envs.batch import TaskBatch, TaskOptions
