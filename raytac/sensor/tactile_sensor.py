@@ -135,7 +135,8 @@ class TactileSensor:
     def __reduce__(self) -> tuple[Any, ...]:
         """A sensor of the same settings.
 
-        Raises ``InputError``: an optical mode of one's own, which only its maker can copy, or markers with a history, which would be lost.
+        Raises ``InputError``: an optical mode that was given built, which only its maker can copy, or markers with a history, which would
+        be lost.
         """
         if isinstance(self.optics, BuiltOptics):
             rule = "cannot be copied or pickled with its sensor: make the other sensor with an optical mode of its own"

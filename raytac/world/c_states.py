@@ -111,7 +111,7 @@ class CStates:
             self.failed[b] = False
 
     def hold(self, data: mujoco.MjData) -> None:
-        """Keep the robot of a scene at its start; a model of one's own keeps its present controls."""
+        """Keep the robot of a scene at its start; a given model keeps its present controls."""
         if self.composed.scene is None:
             return
         data.ctrl[:] = self.composed.ctrl

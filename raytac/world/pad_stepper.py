@@ -35,7 +35,7 @@ class PadStepper:
             pads.step(model, data)  # in place of mujoco.mj_step
         frame = pads.observe(data)["left"]
 
-        mujoco.mj_step1(model, data)  # or around a step of one's own
+        mujoco.mj_step1(model, data)  # or around your own step
         pads.add(model, data)
         mujoco.mj_step2(model, data)
         pads.finish(model, data)
@@ -72,7 +72,7 @@ class PadStepper:
             settings: ``outputs``, ``markers``, ``optics``, ``resolution``, ``device`` and ``pitch`` of every sensor.
 
         Raises:
-            InputError: what ``TactileWorld`` refuses of a model of one's own.
+            InputError: what ``TactileWorld`` refuses of a given model.
         """
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
         self.model = model

@@ -71,8 +71,8 @@ class WarpWorld:
                 follows no targets then.
             device: "auto", "cpu" or "cuda".
             frequency: of the springs in the joints [rad/s].
-            launches: steps of MuJoCo in a control step, as many as the scene's if None. Of more a world divides one in which something
-                moves fast near a pad.
+            launches: steps of MuJoCo in a control step, as many as the scene's if None. With more, a world divides a step in
+                which something moves fast near a pad.
             contacts, rows: memory for contacts and constraint rows, an environment each; None is a guess.
 
         Raises:

@@ -61,11 +61,11 @@ class TactileWorld:
         mount(spec, "gelsight_mini", site="left_tip", name="left")  # on a MuJoCo model of your own
         world = TactileWorld(spec, touches=["cube"], control_timestep=0.02, num_envs=8)
 
-    A model of one's own keeps its options, and moves to the bit as MuJoCo alone moves it while no pad is touched. Only MuJoCo's automatic
-    reset is disabled, since an environment that breaks down is marked in ``failed``. The model is copied.
+    A MuJoCo model that is given keeps its options, and moves to the bit as MuJoCo alone moves it while no pad is touched. Only MuJoCo's
+    automatic reset is disabled, since an environment that breaks down is marked in ``failed``. The model is copied.
 
     Attributes:
-        scene: the task scene; None of a model of one's own.
+        scene: the task scene; None if a MuJoCo model was given.
         physics: configuration that is used.
         model: MuJoCo's model of the scene.
         engine: settings of MuJoCo Warp; None is C MuJoCo.
@@ -137,9 +137,7 @@ class TactileWorld:
             rule = "must be a task scene, its name or path, a mujoco.MjSpec or a mujoco.MjModel"
             raise InputError("scene", value=type(scene).__name__, rule=rule)
         if isinstance(scene, (str, Path)) and Path(scene).suffix.lower() in (".xml", ".mjcf", ".urdf", ".mjb"):
-            rule = (
-                "is no task scene: a model of one's own is given as mujoco.MjSpec.from_file(path), with sensors by raytac.mount"
-            )
+            rule = "is no task scene: give a MuJoCo model as mujoco.MjSpec.from_file(path), with sensors by raytac.mount"
             raise InputError("scene", value=scene, rule=rule)
         for given, value in own.items():
             if value is not None and not is_own:
@@ -150,7 +148,7 @@ class TactileWorld:
         if name not in WORLD_PADS.names:
             raise InputError("physics", value=name, rule="has pads for presses only, none for worlds", choices=WORLD_PADS.names)
         if is_own and self.physics.is_simulated:
-            rule = "needs a task scene: bodies of a model of one's own meet rigid pads"
+            rule = "needs a task scene: in other MuJoCo models pads are rigid"
             raise InputError("physics", value=name, rule=rule, choices=("rigid",))
         if isinstance(self.engine, WarpEngine) and self.physics.is_simulated:
             raise InputError("physics", value=name, rule="needs engine='mujoco': MuJoCo Warp has rigid pads", choices=("rigid",))
