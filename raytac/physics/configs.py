@@ -12,7 +12,7 @@ from raytac.specs.press import PADS, PressScene
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
-    from raytac.physics.press import PressSettings
+    from raytac.physics.base import TargetArrays
     from raytac.physics.rigid.pad import RigidPad
     from raytac.physics.soft.mesh import PadMesh
     from raytac.physics.soft.pad import SoftPad
@@ -28,11 +28,20 @@ class Rigid:
     def label(self) -> str:
         return "rigid"
 
-    def build(self, spec: SensorSpec, press: PressScene, *, device: str = "auto", **settings: Unpack[PressSettings]) -> RigidPad:
+    def build(
+        self,
+        spec: SensorSpec,
+        press: PressScene,
+        *,
+        pitch: float,
+        num_envs: int = 1,
+        device: str = "auto",
+        **own: Unpack[TargetArrays],
+    ) -> RigidPad:
         """The pad of a press; always on the CPU. See ``PhysicsConfig.build``."""
         from raytac.physics.rigid.pad import RigidPad
 
-        return RigidPad(spec, press, **settings)
+        return RigidPad(spec, press, pitch=pitch, num_envs=num_envs, **own)
 
 
 @dataclass(frozen=True)
@@ -64,10 +73,28 @@ class Ipc:
         level = self.level or PADS[0]
         return f"ipc-{level if isinstance(level, str) else 'own'}"
 
-    def build(self, spec: SensorSpec, press: PressScene, *, device: str = "auto", **settings: Unpack[PressSettings]) -> SoftPad:
+    def build(
+        self,
+        spec: SensorSpec,
+        press: PressScene,
+        *,
+        pitch: float,
+        num_envs: int = 1,
+        device: str = "auto",
+        **own: Unpack[TargetArrays],
+    ) -> SoftPad:
         """The pad of a press, as ``PhysicsConfig.build``; no ray is traced: CUDA needs no OptiX."""
         from raytac.physics.soft.pad import SoftPad
 
         device = resolve_device(device, ray_tracing=False)
-        own = {"level": self.level or PADS[0], "correction": self.correction, "control": self.control}
-        return SoftPad(spec, press, device=device, **own, **settings)
+        return SoftPad(
+            spec,
+            press,
+            level=self.level or PADS[0],
+            correction=self.correction,
+            control=self.control,
+            pitch=pitch,
+            num_envs=num_envs,
+            device=device,
+            **own,
+        )
