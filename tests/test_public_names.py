@@ -60,7 +60,7 @@ def test_typed_keyword_arguments_are_those_that_are_passed_on() -> None:
     from raytac.envs.batch import TaskBatch, TaskOptions
     from raytac.physics.base import TargetArrays
     from raytac.physics.press import PressPad, PressSettings, PressTargets
-    from raytac.sensor.tactile_sensor import EnvironmentTargets
+    from raytac.sensor.options import EnvironmentTargets
 
     assert set(TargetArrays.__annotations__) == keywords(PressTargets)
     assert set(PressSettings.__annotations__) == keywords(PressPad) | keywords(PressTargets)

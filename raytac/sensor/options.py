@@ -15,6 +15,7 @@ from raytac.markers.base import MarkersConfig
 from raytac.markers.registry import MARKERS, markers_config, models_without_coat
 from raytac.optics.base import OPTICAL_OUTPUTS
 from raytac.optics.registry import OPTICS
+from raytac.physics.base import TargetArrays
 from raytac.specs import PressScene, load_press
 
 if TYPE_CHECKING:
@@ -25,6 +26,12 @@ LARGEST_SIDE = 8192
 """Longest side of an image [px], as in sensor files."""
 SHAPE_TOLERANCE = 0.02
 """Largest deviation from the aspect ratio without a warning: rounding to whole pixels."""
+
+
+class EnvironmentTargets(TargetArrays, total=False):
+    """Targets and seeds of the B environments of a press, as ``TactileSensor.load`` says."""
+
+    seeds: Sequence[int] | None
 
 
 class SensorSettings(TypedDict, total=False):

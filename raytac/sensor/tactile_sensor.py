@@ -26,15 +26,16 @@ from raytac.optics.registry import chosen_optics
 from raytac.physics.base import Pad, PadReading, PhysicsConfig, TargetArrays
 from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
 from raytac.physics.soft.contact_width import cells_across, holds_force, warn_if_narrow
-from raytac.sensor.options import checked_markers, checked_outputs, checked_resolution, press_scene, warn_of_other_shape
+from raytac.sensor.options import (
+    EnvironmentTargets,
+    checked_markers,
+    checked_outputs,
+    checked_resolution,
+    press_scene,
+    warn_of_other_shape,
+)
 from raytac.specs import PressScene, SensorSpec, press_of, validate_press
 from raytac.specs.sensor_file import sensor_spec
-
-
-class EnvironmentTargets(TargetArrays, total=False):
-    """Targets and seeds of the B environments of a press, as ``TactileSensor.load`` says."""
-
-    seeds: Sequence[int] | None
 
 
 class TactileSensor:
@@ -231,18 +232,8 @@ class TactileSensor:
         press = press_scene(scene)
         own_seeds = None if seeds is None else check_seeds("seeds", seeds, self.num_envs)
         self._used = scene_physics(self.physics, press)
-        self._pad = self._used.build(
-            self.spec,
-            press,
-            pitch=self.pitch,
-            num_envs=self.num_envs,
-            device=self.device,
-            offsets=offsets,
-            depths=depths,
-            rotations=rotations,
-            shears=shears,
-            twists=twists,
-        )
+        own = TargetArrays(offsets=offsets, depths=depths, rotations=rotations, shears=shears, twists=twists)
+        self._pad = self._used.build(self.spec, press, pitch=self.pitch, num_envs=self.num_envs, device=self.device, **own)
         self._is_narrow = False
         if own_seeds is not None and self.markers is not None:
             self.marker_tracker.reseed(range(self.num_envs), own_seeds)
