@@ -1,5 +1,7 @@
 """Marks by place: which tests need a renderer or a solver, and which run scripts. ``make check`` runs the others.
 
+The solver is Warp, which sensors, markers and worlds with rigid pads import too.
+
 A name is a folder of ``tests`` or a file in it; single tests carry the mark themselves. With ``-m "not renderer"`` the packages of the
 renderer cannot be imported, with ``-m "not solver"`` those of the solver: a test that needs them and does not say so fails, and names them.
 """
@@ -47,28 +49,40 @@ PLACES: dict[str, tuple[str, ...]] = {
         "view/test_view_command.py",
     ),
     "solver": (
-        "envs/test_rsl_warp.py",
-        "envs/test_warp_batch.py",
-        "envs/test_warp_variation.py",
-        "envs/test_warp_vector.py",
+        "dataset",
+        "envs",
         "ipc",
-        "markers/test_other_models.py",
+        "markers",
+        "observe/test_observer.py",
         "physics/rigid/test_pad_search.py",
+        "physics/rigid/test_pierced.py",
         "physics/rigid/test_step_kernels.py",
+        "physics/rigid/test_underside.py",
+        "physics/test_rigid_deep.py",
         "physics/test_soft.py",
         "physics/test_soft_batch.py",
         "physics/test_soft_forces.py",
         "physics/test_soft_objects.py",
         "physics/test_soft_scene.py",
         "regression",
+        "report/test_compare_metrics.py",
+        "report/test_equal_error.py",
+        "report/test_physics_error.py",
+        "report/test_press.py",
+        "report/test_press_store.py",
+        "report/test_preview.py",
+        "robots",
+        "test_arguments.py",
+        "test_device.py",
+        "test_fuzz_inputs.py",
+        "test_sensor.py",
         "test_sensor_soft.py",
         "test_threads.py",
         "test_warp_runtime.py",
-        "world/engine",
-        "world/test_held.py",
-        "world/test_mujoco_rows.py",
-        "world/test_pad_shear.py",
-        "world/test_soft_world.py",
+        "view/test_drawing.py",
+        "view/test_press_session.py",
+        "view/test_world_session.py",
+        "world",
     ),
     "script": (
         "dataset/test_ray_cluster.py",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -54,11 +55,23 @@ def test_a_package_of_a_missing_mark_is_found_and_named_but_not_imported(monkeyp
     assert marks.block("not slow") is None
 
 
+def collected(*places: str) -> str:
+    """Output of the collection of the quick tests, which must succeed."""
+    command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider", "-m", QUICK]
+    run = subprocess.run([*command, *places], cwd=TESTS.parent, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stdout
+    return run.stdout
+
+
 def test_files_that_are_left_out_are_not_even_imported() -> None:
     """Else they would import what their marks name."""
-    command = [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider", "-m", QUICK]
-    run = subprocess.run(
-        [*command, "tests/ipc", "tests/optics", __file__], cwd=TESTS.parent, capture_output=True, text=True, check=False
-    )
-    assert run.returncode == 0, run.stdout
-    assert "test_every_place_exists" in run.stdout and "tests/ipc/" not in run.stdout and "tests/optics/" not in run.stdout
+    text = collected("tests/ipc", "tests/optics", __file__)
+    assert "test_every_place_exists" in text and "tests/ipc/" not in text and "tests/optics/" not in text
+
+
+@pytest.mark.script
+def test_make_check_can_collect_its_tests() -> None:
+    """No file that it takes imports a renderer or a solver at its top; ``make test`` says so before ``make check`` fails."""
+    assert QUICK in (TESTS.parent / "Makefile").read_text(encoding="utf-8")
+    (count,) = re.findall(r"^(\d+)/\d+ tests collected", collected("tests"), flags=re.MULTILINE)
+    assert int(count) > 500

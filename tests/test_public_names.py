@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import pkgutil
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -47,6 +49,30 @@ def test_importing_the_package_loads_no_part_of_it() -> None:
     code = "import sys, raytac; print(*sorted(m for m in sys.modules if m.startswith(('raytac.', 'numpy', 'mujoco', 'drjit', 'warp'))))"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.split() == ["raytac.installation"]
+
+
+def keywords(function: Callable[..., object], *others: str) -> set[str]:
+    """Names of the arguments that are given by keyword, but ``others``."""
+    parameters = inspect.signature(function).parameters.values()
+    return {one.name for one in parameters if one.kind is one.KEYWORD_ONLY} - set(others)
+
+
+@pytest.mark.solver
+def test_typed_keyword_arguments_are_those_that_are_passed_on() -> None:
+    """Names that type checkers know for ``**own``, ``**settings`` and ``**options`` of public functions."""
+    from raytac.envs.batch import TaskBatch, TaskOptions
+    from raytac.physics.base import TargetArrays
+    from raytac.physics.press import PressPad, PressSettings, PressTargets
+    from raytac.sensor.options import EnvironmentTargets
+
+    assert set(TargetArrays.__annotations__) == keywords(PressTargets)
+    assert set(PressSettings.__annotations__) == keywords(PressPad) | keywords(PressTargets)
+    assert set(EnvironmentTargets.__annotations__) == keywords(raytac.TactileSensor.load)
+    assert set(TaskOptions.__annotations__) == keywords(TaskBatch, "num_envs")
+    assert set(raytac.sensor.SensorSettings.__annotations__) == keywords(raytac.TactileSensor, "physics", "num_envs", "seed")
+    for taker in (raytac.TactileSensor.press, raytac.PadStepper, raytac.TactileReader, raytac.envs.PushCubeEnv):
+        (rest,) = (one for one in inspect.signature(taker).parameters.values() if one.kind is one.VAR_KEYWORD)
+        assert str(rest.annotation).startswith("Unpack["), f"{taker}: {rest}"
 
 
 @pytest.mark.parametrize("path", USERS, ids=lambda path: str(path.relative_to(ROOT)))

@@ -32,6 +32,12 @@ def test_docstrings_begin_with_no_question_word(trees: dict[str, ast.Module]) ->
     assert not wrong, "begin with a noun phrase, an imperative verb or 'True if':\n" + "\n".join(wrong)
 
 
+def test_docstrings_begin_with_one_short_line(trees: dict[str, ast.Module]) -> None:
+    firsts = [(name, text.split("\n", 1)[0]) for name, tree in trees.items() for text in house.docstrings(tree)]
+    wrong = [f"{name}: {first}" for name, first in firsts if len(first) > house.LONG_LINE]
+    assert not wrong, f"first lines of at most {house.LONG_LINE} characters:\n" + "\n".join(wrong)
+
+
 def test_names_say_what_they_hold(trees: dict[str, ast.Module]) -> None:
     wrong = [f"{name}: {word}" for name, tree in trees.items() for word in house.names_bound(tree) if word.strip("_") in NAMES]
     assert not wrong, "name the result, direction, displacement or path instead:\n" + "\n".join(wrong)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -13,7 +13,7 @@ from raytac.cli.shared import ShadowOptions, SolverOptions, chosen_physics, name
 from raytac.frame import OUTPUTS
 from raytac.io.options import parse_outputs, parse_resolution
 from raytac.markers import MARKERS
-from raytac.optics import INTEGRATORS, OPTICS, OpticsConfig
+from raytac.optics import INTEGRATORS, OPTICS, OpticalMode, OpticsConfig
 from raytac.physics import PHYSICS
 from raytac.report.press import run_press
 from raytac.sensor import TactileSensor, sensor_outputs
@@ -90,7 +90,7 @@ class PressArgs(ShadowOptions, SolverOptions):
         out = self.folder("press", "-".join([scene.name, *others]))
         return print_paths(run_press(sensor, scene, out, outputs=outputs, start=start, progress=True))
 
-    def _optics(self) -> OpticsConfig[Any]:
+    def _optics(self) -> OpticsConfig[OpticalMode]:
         """Configuration of the optical mode, with every option that was given as its field."""
         given = {name: getattr(self, name) for name in ("calibration", "weights", "integrator", "spp")}
         options = {name: value for name, value in given.items() if value is not None} | self.chosen_shadows()

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -43,6 +43,21 @@ class StepResult:
     success: np.ndarray
     failed: np.ndarray
     """Environments whose physics broke down: truncated, reward 0, last sound observation."""
+
+
+class TaskOptions(TypedDict, total=False):
+    """Keyword arguments of ``TaskBatch`` but ``num_envs``, which environments take too."""
+
+    physics: str | PhysicsConfig | None
+    tactile: ObservationSettings | Sequence[str] | str | None
+    body_seen: bool | None
+    action: str
+    randomization: Randomization | None
+    max_episode_steps: int | None
+    device: str
+    seed: int
+    scene: str | Path | TaskScene | None
+    pitch: float | None
 
 
 class TaskBatch:

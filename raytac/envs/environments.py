@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import Connection
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
 import gymnasium
 import numpy as np
@@ -12,7 +12,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from raytac.envs.batch import StepResult, TaskBatch
+from raytac.envs.batch import StepResult, TaskBatch, TaskOptions
 from raytac.envs.processes import serve
 from raytac.envs.task_rules import Task
 from raytac.errors import InputError
@@ -32,7 +32,7 @@ class _Task:
     metadata: dict[str, Any] = {"render_modes": list(_RENDER_MODES)}  # noqa: RUF012 (Gymnasium reads it from the class)
     closed = False
 
-    def _compose(self, num_envs: int, render_mode: str | None, options: dict[str, Any]) -> None:
+    def _compose(self, num_envs: int, render_mode: str | None, options: TaskOptions) -> None:
         """Compose the world of ``TaskBatch``; InputError for an unknown mode; raises as it."""
         if render_mode is not None and render_mode not in _RENDER_MODES:
             raise InputError("render_mode", value=render_mode, rule="must be None or a known mode", choices=_RENDER_MODES)
@@ -76,7 +76,7 @@ class TactileEnv(_Task, gymnasium.Env):
     reward), ``success`` and ``failed``.
     """
 
-    def __init__(self, *, render_mode: str | None = None, **options: Any) -> None:
+    def __init__(self, *, render_mode: str | None = None, **options: Unpack[TaskOptions]) -> None:
         """Compose the world of ``TaskBatch``, raising as it; ``render_mode``: None or ``rgb_array``."""
         self._compose(1, render_mode, options)
         self.observation_space, self.action_space = self._spaces()
@@ -142,7 +142,7 @@ class TactileVectorEnv(_Task, gymnasium.vector.VectorEnv):
         *,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
         render_mode: str | None = None,
-        **options: Any,
+        **options: Unpack[TaskOptions],
     ) -> None:
         """Compose the world.
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from raytac.checks import check_mapping, check_names, check_truth, check_whole, is_number, is_whole
 from raytac.errors import InputError
 from raytac.io.options import parse_resolution
 from raytac.markers.base import MarkersConfig
 from raytac.markers.registry import markers_config
-from raytac.optics.base import OpticsConfig
+from raytac.optics.base import OpticalMode, OpticsConfig
 from raytac.optics.registry import chosen_optics
 from raytac.sensor.options import LARGEST_SIDE, checked_resolution
 from raytac.specs.sensor import SensorSpec
@@ -69,7 +68,7 @@ class ObservationSettings:
     """Divide by ``SCALES``; else SI units. Images stay 8-bit and contact a ratio."""
     scales: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
     """In place of those of ``SCALES``, by modality."""
-    optics: str | OpticsConfig[Any] = "taxim"
+    optics: str | OpticsConfig[OpticalMode] = "taxim"
     """As of ``TactileSensor``: a name, or a configuration."""
     markers: str | MarkersConfig = "fots"
     """As of ``TactileSensor``."""

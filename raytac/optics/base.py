@@ -75,7 +75,7 @@ def start(mode: OpticalMode, surface: GelSurface) -> Callable[[], OpticsImages]:
     return lambda: images
 
 
-Mode = TypeVar("Mode", bound=OpticalMode)
+Mode = TypeVar("Mode", bound=OpticalMode, covariant=True)
 
 
 class OpticsConfig(Generic[Mode]):
@@ -163,7 +163,7 @@ class Variant:
     """The same for a reader."""
     short: str
     """Label of its point in a figure."""
-    config: OpticsConfig[Any]
+    config: OpticsConfig[OpticalMode]
     note: str = ""
     """Remark for readers of its figures."""
     slow: bool = False

@@ -22,7 +22,7 @@ class Cropped(OpticsConfig[OpticalMode]):
     Modes that need all of the image, as for shadows of a table, and a user's modes render it and cut.
     """
 
-    config: OpticsConfig[Any]
+    config: OpticsConfig[OpticalMode]
     """Of the mode."""
     crop: tuple[int, int, int, int]
     """Left, top, width and height [px] at the mode's resolution."""

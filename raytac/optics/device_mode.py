@@ -17,7 +17,7 @@ from raytac.checks import check_names
 from raytac.device import total_memory
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid, rounded_envs
-from raytac.optics.base import OpticsConfig, OpticsImages
+from raytac.optics.base import OpticalMode, OpticsConfig, OpticsImages
 from raytac.optics.camera import Pinhole
 from raytac.optics.geometry import CoatField, CoatLayout, check_view, see, seen_images
 from raytac.optics.ink import checked_ink
@@ -75,7 +75,7 @@ class DeviceMode(ABC):
     def __init__(
         self,
         sensor: SensorSpec,
-        config: OpticsConfig[Any],
+        config: OpticsConfig[OpticalMode],
         *,
         resolution: tuple[int, int] | None = None,
         outputs: tuple[str, ...] = ("rgb",),

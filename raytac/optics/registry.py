@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from raytac.checks import check_methods
 from raytac.optics.base import BuiltOptics, OpticalMode, OpticsConfig
 from raytac.registry import Registry
 
-OPTICS: Registry[OpticsConfig[Any]] = Registry(
+OPTICS: Registry[OpticsConfig[OpticalMode]] = Registry(
     "optics",
     {
         "raytrace": "raytac.optics.trace.config:RayTraced",
@@ -20,7 +18,7 @@ OPTICS: Registry[OpticsConfig[Any]] = Registry(
 register = OPTICS.register
 
 
-def chosen_optics(choice: str | OpticsConfig[Any] | OpticalMode) -> OpticsConfig[Any]:
+def chosen_optics(choice: str | OpticsConfig[OpticalMode] | OpticalMode) -> OpticsConfig[OpticalMode]:
     """Configuration of a name or a built mode, or itself; InputError for anything else."""
     config = OPTICS.config(choice)  # type: ignore[arg-type]
     if isinstance(config, OpticsConfig):

@@ -1,6 +1,7 @@
 from .base import Pad as Pad
 from .base import PadReading as PadReading
 from .base import PhysicsConfig as PhysicsConfig
+from .base import TargetArrays as TargetArrays
 from .configs import Ipc as Ipc
 from .configs import Rigid as Rigid
 from .geoms import body_parts as body_parts

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from functools import cached_property
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, TypedDict, Unpack
 
 import numpy as np
 
@@ -122,6 +122,16 @@ class PadReading:
         return part
 
 
+class TargetArrays(TypedDict, total=False):
+    """Targets of the B environments of a press, as ``raytac.TactileSensor.load`` says."""
+
+    offsets: np.ndarray | None
+    depths: np.ndarray | None
+    rotations: np.ndarray | None
+    shears: np.ndarray | None
+    twists: np.ndarray | None
+
+
 class Pad(Protocol):
     """The gel with the object of a press scene before it; ``PressPad`` has what all pads share."""
 
@@ -166,13 +176,15 @@ class PhysicsConfig(Protocol):
         """Name for headers and reports."""
         ...
 
-    def build(self, spec: SensorSpec, press: PressScene, *, pitch: float, num_envs: int, device: str, **own: Any) -> Pad:
+    def build(
+        self, spec: SensorSpec, press: PressScene, *, pitch: float, num_envs: int, device: str, **own: Unpack[TargetArrays]
+    ) -> Pad:
         """The pad of a press.
 
         Args:
             pitch: spacing of the grid of surfaces [m].
             device: ``auto``, ``cpu`` or ``cuda``.
-            own: ``offsets``, ``depths``, ``rotations``, ``shears`` and ``twists`` of B environments, see ``PressTargets``.
+            own: targets of B environments, see ``PressTargets``.
 
         Raises:
             BackendError: what it needs is not installed or does not work here.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Unpack
 
 from raytac.checks import check_kind, check_known, check_methods
 from raytac.device import resolve_device
@@ -12,6 +12,7 @@ from raytac.specs.press import PADS, PressScene
 from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
+    from raytac.physics.base import TargetArrays
     from raytac.physics.rigid.pad import RigidPad
     from raytac.physics.soft.mesh import PadMesh
     from raytac.physics.soft.pad import SoftPad
@@ -27,11 +28,20 @@ class Rigid:
     def label(self) -> str:
         return "rigid"
 
-    def build(self, spec: SensorSpec, press: PressScene, *, device: str = "auto", **settings: Any) -> RigidPad:
+    def build(
+        self,
+        spec: SensorSpec,
+        press: PressScene,
+        *,
+        pitch: float,
+        num_envs: int = 1,
+        device: str = "auto",
+        **own: Unpack[TargetArrays],
+    ) -> RigidPad:
         """The pad of a press; always on the CPU. See ``PhysicsConfig.build``."""
         from raytac.physics.rigid.pad import RigidPad
 
-        return RigidPad(spec, press, **settings)
+        return RigidPad(spec, press, pitch=pitch, num_envs=num_envs, **own)
 
 
 @dataclass(frozen=True)
@@ -63,10 +73,28 @@ class Ipc:
         level = self.level or PADS[0]
         return f"ipc-{level if isinstance(level, str) else 'own'}"
 
-    def build(self, spec: SensorSpec, press: PressScene, *, device: str = "auto", **settings: Any) -> SoftPad:
+    def build(
+        self,
+        spec: SensorSpec,
+        press: PressScene,
+        *,
+        pitch: float,
+        num_envs: int = 1,
+        device: str = "auto",
+        **own: Unpack[TargetArrays],
+    ) -> SoftPad:
         """The pad of a press, as ``PhysicsConfig.build``; no ray is traced: CUDA needs no OptiX."""
         from raytac.physics.soft.pad import SoftPad
 
         device = resolve_device(device, ray_tracing=False)
-        own = {"level": self.level or PADS[0], "correction": self.correction, "control": self.control}
-        return SoftPad(spec, press, device=device, **own, **settings)
+        return SoftPad(
+            spec,
+            press,
+            level=self.level or PADS[0],
+            correction=self.correction,
+            control=self.control,
+            pitch=pitch,
+            num_envs=num_envs,
+            device=device,
+            **own,
+        )

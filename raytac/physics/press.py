@@ -5,13 +5,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from typing import Required, Unpack
 
 import numpy as np
 
 from raytac.checks import MOST_ENVIRONMENTS, check_numbers, check_whole
 from raytac.errors import InputError, MeshError, SpecError
 from raytac.gel.surface import GelSurface, make_grid
-from raytac.physics.base import PadReading
+from raytac.physics.base import PadReading, TargetArrays
 from raytac.physics.objects import object_parts
 from raytac.se3 import rotation_of
 from raytac.shapes.part import Part
@@ -181,6 +182,13 @@ def _check_trajectory(scene: PressScene, gelpad: GelpadSpec, parts: Sequence[Par
             raise InputError("depths [mm]", value=float(bad[0]) * 1e3, rule=within)
 
 
+class PressSettings(TargetArrays, total=False):
+    """Keyword arguments of ``PressPad``."""
+
+    pitch: Required[float]
+    num_envs: int
+
+
 class PressPad(ABC):
     """Base of the pads of a press: the object before the gel, and the loop over the stages.
 
@@ -195,7 +203,7 @@ class PressPad(ABC):
     """
 
     def __init__(
-        self, sensor: SensorSpec, scene: PressScene, *, pitch: float, num_envs: int = 1, **own: np.ndarray | None
+        self, sensor: SensorSpec, scene: PressScene, *, pitch: float, num_envs: int = 1, **own: Unpack[TargetArrays]
     ) -> None:
         """Check the scene, and build grid and object.
 

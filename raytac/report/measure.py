@@ -9,13 +9,16 @@ import subprocess
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface
 from raytac.io.metrics import Metric
+
+Input = TypeVar("Input")
+"""Argument of a call that is timed."""
 
 
 def moving(surfaces: Sequence[GelSurface], batch: int, count: int) -> list[GelSurface]:
@@ -31,21 +34,21 @@ def moving(surfaces: Sequence[GelSurface], batch: int, count: int) -> list[GelSu
     return batches
 
 
-def once(call: Callable[[Any], object], value: Any) -> float:
+def once(call: Callable[[Input], object], value: Input) -> float:
     """Milliseconds of one call, which must return only when its work is done."""
     start = time.perf_counter()
     call(value)
     return 1e3 * (time.perf_counter() - start)
 
 
-def timed(call: Callable[[Any], object], inputs: Sequence[Any], frames: int) -> np.ndarray:
+def timed(call: Callable[[Input], object], inputs: Sequence[Input], frames: int) -> np.ndarray:
     """Milliseconds of ``frames`` warm calls with ``inputs`` in turn, each called once before."""
     for value in inputs:
         call(value)
     return np.array([once(call, inputs[k % len(inputs)]) for k in range(frames)])
 
 
-def timed_within(call: Callable[[Any], object], inputs: Sequence[Any], frames: int, budget_s: float) -> np.ndarray:
+def timed_within(call: Callable[[Input], object], inputs: Sequence[Input], frames: int, budget_s: float) -> np.ndarray:
     """As ``timed``, in at most ``budget_s`` [s] if three calls fit; a slow call warms up once."""
     call(inputs[0])
     first = once(call, inputs[1 % len(inputs)])

@@ -30,7 +30,7 @@ class Tracers:
         """Ray tracer of images of ``size`` (width, height) [px]; path tracers have one layer."""
         return self.mode(size, RayTraced() if config is None else config, outputs)  # type: ignore[return-value]
 
-    def mode(self, size: tuple[int, int], config: OpticsConfig[Any], outputs: tuple[str, ...] = ("rgb",)) -> OpticalMode:
+    def mode(self, size: tuple[int, int], config: OpticsConfig[OpticalMode], outputs: tuple[str, ...] = ("rgb",)) -> OpticalMode:
         """The same of any optical mode."""
         key = repr((size, config, outputs))
         if key not in self.built:

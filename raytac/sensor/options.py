@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypedDict
 
 from raytac.checks import check_names, check_whole
 from raytac.errors import InputError
@@ -15,10 +15,11 @@ from raytac.markers.base import MarkersConfig
 from raytac.markers.registry import MARKERS, markers_config, models_without_coat
 from raytac.optics.base import OPTICAL_OUTPUTS
 from raytac.optics.registry import OPTICS
+from raytac.physics.base import TargetArrays
 from raytac.specs import PressScene, load_press
 
 if TYPE_CHECKING:
-    from raytac.optics.base import OpticsConfig
+    from raytac.optics.base import OpticalMode, OpticsConfig
     from raytac.physics.base import PhysicsConfig
 
 LARGEST_SIDE = 8192
@@ -27,13 +28,30 @@ SHAPE_TOLERANCE = 0.02
 """Largest deviation from the aspect ratio without a warning: rounding to whole pixels."""
 
 
-def sensor_outputs(optics: str | OpticsConfig[Any] | type[OpticsConfig[Any]]) -> tuple[str, ...]:
+class EnvironmentTargets(TargetArrays, total=False):
+    """Targets and seeds of the B environments of a press, as ``TactileSensor.load`` says."""
+
+    seeds: Sequence[int] | None
+
+
+class SensorSettings(TypedDict, total=False):
+    """Keyword arguments of ``TactileSensor`` that a model's sensors take, all of them the same."""
+
+    outputs: Sequence[str] | str
+    markers: str | MarkersConfig | None
+    optics: str | OpticsConfig[OpticalMode] | OpticalMode
+    resolution: tuple[int, int] | str | None
+    device: str
+    pitch: float | None
+
+
+def sensor_outputs(optics: str | OpticsConfig[OpticalMode] | type[OpticsConfig[OpticalMode]]) -> tuple[str, ...]:
     """Outputs of a sensor with an optical mode: all but those that only other modes make."""
     made = (OPTICS.config_class(optics) if isinstance(optics, str) else optics).outputs
     return tuple(name for name in OUTPUTS if name not in OPTICAL_OUTPUTS or name in made)
 
 
-def checked_outputs(outputs: Sequence[str] | str, optics: OpticsConfig[Any]) -> tuple[str, ...]:
+def checked_outputs(outputs: Sequence[str] | str, optics: OpticsConfig[OpticalMode]) -> tuple[str, ...]:
     """Names in the order of ``OUTPUTS``; ``InputError`` if unknown, or not made by ``optics``."""
     several = outputs if isinstance(outputs, (list, tuple)) else ()
     given = [outputs] if isinstance(outputs, str) else [name for name in several if isinstance(name, str)]

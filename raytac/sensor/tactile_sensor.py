@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -23,10 +23,17 @@ from raytac.markers.registry import MARKERS
 from raytac.markers.tracker import MarkerFrame, MarkerTracker
 from raytac.optics.base import OPTICAL_OUTPUTS, BuiltOptics, OpticalMode, OpticsConfig, OpticsImages, start
 from raytac.optics.registry import chosen_optics
-from raytac.physics.base import Pad, PadReading, PhysicsConfig
+from raytac.physics.base import Pad, PadReading, PhysicsConfig, TargetArrays
 from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
 from raytac.physics.soft.contact_width import cells_across, holds_force, warn_if_narrow
-from raytac.sensor.options import checked_markers, checked_outputs, checked_resolution, press_scene, warn_of_other_shape
+from raytac.sensor.options import (
+    EnvironmentTargets,
+    checked_markers,
+    checked_outputs,
+    checked_resolution,
+    press_scene,
+    warn_of_other_shape,
+)
 from raytac.specs import PressScene, SensorSpec, press_of, validate_press
 from raytac.specs.sensor_file import sensor_spec
 
@@ -50,7 +57,7 @@ class TactileSensor:
     """(width, height) of every image [px]."""
     grid: PadGrid
     """Nodes of the pad's surface."""
-    optics: OpticsConfig[Any]
+    optics: OpticsConfig[OpticalMode]
     """Configuration of the optical mode."""
     pitch: float
     """Spacing of the nodes that was asked for [m]; ``grid`` fits it to the pad."""
@@ -64,7 +71,7 @@ class TactileSensor:
         sensor: str | Path | SensorSpec = "gelsight_mini",
         *,
         physics: str | PhysicsConfig | None = None,
-        optics: str | OpticsConfig[Any] | OpticalMode = "raytrace",
+        optics: str | OpticsConfig[OpticalMode] | OpticalMode = "raytrace",
         outputs: Sequence[str] | str = ("rgb",),
         resolution: tuple[int, int] | str | None = None,
         device: str = "auto",
@@ -129,7 +136,8 @@ class TactileSensor:
     def __reduce__(self) -> tuple[Any, ...]:
         """A sensor of the same settings.
 
-        Raises ``InputError``: an optical mode of one's own, which only its maker can copy, or markers with a history, which would be lost.
+        Raises ``InputError``: an optical mode that was given built, which only its maker can copy, or markers with a history, which would
+        be lost.
         """
         if isinstance(self.optics, BuiltOptics):
             rule = "cannot be copied or pickled with its sensor: make the other sensor with an optical mode of its own"
@@ -171,7 +179,7 @@ class TactileSensor:
         scale: float | None = None,
         pitch: float | None = None,
         progress: bool = False,
-        **own: Any,
+        **own: Unpack[EnvironmentTargets],
     ) -> TactileFrame:
         """Run the scene's trajectory; frame at its peak: the end of the last stage but a release.
 
@@ -224,18 +232,8 @@ class TactileSensor:
         press = press_scene(scene)
         own_seeds = None if seeds is None else check_seeds("seeds", seeds, self.num_envs)
         self._used = scene_physics(self.physics, press)
-        self._pad = self._used.build(
-            self.spec,
-            press,
-            pitch=self.pitch,
-            num_envs=self.num_envs,
-            device=self.device,
-            offsets=offsets,
-            depths=depths,
-            rotations=rotations,
-            shears=shears,
-            twists=twists,
-        )
+        own = TargetArrays(offsets=offsets, depths=depths, rotations=rotations, shears=shears, twists=twists)
+        self._pad = self._used.build(self.spec, press, pitch=self.pitch, num_envs=self.num_envs, device=self.device, **own)
         self._is_narrow = False
         if own_seeds is not None and self.markers is not None:
             self.marker_tracker.reseed(range(self.num_envs), own_seeds)

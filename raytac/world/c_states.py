@@ -1,4 +1,4 @@
-"""States of a world's environments in C MuJoCo: their starts, their steps with the pads, and the controllers that drive them."""
+"""Environments of a world in C MuJoCo: starts, steps with the pads, and controllers."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class CStates:
             self.failed[b] = False
 
     def hold(self, data: mujoco.MjData) -> None:
-        """Keep the robot of a scene at its start; a model of one's own keeps its present controls."""
+        """Keep the robot of a scene at its start; a given model keeps its present controls."""
         if self.composed.scene is None:
             return
         data.ctrl[:] = self.composed.ctrl
@@ -169,7 +169,10 @@ def put_to_start(
     joints: np.ndarray | None,
     bodies: Mapping[str, np.ndarray],
 ) -> None:
-    """Put one state to the start, with the arm's joints and bodies at those of ``row`` of ``joints`` (n, joints) and poses (n, 4, 4)."""
+    """Put one state to the start.
+
+    The arm's joints and bodies are at ``row`` of ``joints`` (n, joints) and of poses (n, 4, 4).
+    """
     composed.reset(model, data)
     if joints is not None and composed.arm is not None:
         data.qpos[composed.arm.qpos] = joints[row]

@@ -43,7 +43,7 @@ class PadIndices:
             np.array([model.body(mounted.body).id for mounted in sensors], int),
             np.array([body.index for body in composed.touched], int),
             np.array(geoms, int),
-            # A model of one's own keeps the contacts that it has.
+            # A given model keeps the contacts that it has.
             is_hard(model) if composed.scene is not None else np.zeros(model.ngeom, bool),
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Unpack
 
 import mujoco
 import numpy as np
@@ -20,6 +20,7 @@ from raytac.world.world_state import check_controls
 
 if TYPE_CHECKING:
     from raytac.robots.mount import SensorChoice
+    from raytac.sensor import SensorSettings
     from raytac.world.touched import TouchChoice
 
 
@@ -34,7 +35,7 @@ class PadStepper:
             pads.step(model, data)  # in place of mujoco.mj_step
         frame = pads.observe(data)["left"]
 
-        mujoco.mj_step1(model, data)  # or around a step of one's own
+        mujoco.mj_step1(model, data)  # or around your own step
         pads.add(model, data)
         mujoco.mj_step2(model, data)
         pads.finish(model, data)
@@ -58,7 +59,8 @@ class PadStepper:
         num_envs: int = 1,
         allow_overlap: Sequence[str] = (),
         keyframe: str | None = None,
-        **settings: Any,
+        seed: int = 0,
+        **settings: Unpack[SensorSettings],
     ) -> None:
         """Find sensors and bodies in the model.
 
@@ -66,10 +68,11 @@ class PadStepper:
             model: model with sensors that ``raytac.mount`` put on it.
             sensors, touches, allow_overlap, keyframe: as of ``TactileWorld``.
             num_envs: number of states B that are stepped together.
-            settings: ``outputs``, ``markers``, ``optics``, ``resolution``, ``device``, ``pitch`` and ``seed`` of every sensor.
+            seed: of every random number.
+            settings: ``outputs``, ``markers``, ``optics``, ``resolution``, ``device`` and ``pitch`` of every sensor.
 
         Raises:
-            InputError: what ``TactileWorld`` refuses of a model of one's own.
+            InputError: what ``TactileWorld`` refuses of a given model.
         """
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
         self.model = model
@@ -77,7 +80,7 @@ class PadStepper:
             model, sensors=sensors, touches=touches, keyframe=keyframe, allow_overlap=allow_overlap, own_contact=True
         )
         self.failed = np.zeros(num_envs, bool)
-        self._frames = SensorFrames(self.composed.sensors, num_envs=num_envs, seed=settings.pop("seed", 0), **settings)
+        self._frames = SensorFrames(self.composed.sensors, num_envs=num_envs, seed=seed, **settings)
         self._models = EnvironmentModels(self.composed, num_envs)
         self._pads, self._engine = pads_on_c_mujoco(self.composed, self._models, [mujoco.MjData(model)] * num_envs)
         self._time = np.full(num_envs, -np.inf)

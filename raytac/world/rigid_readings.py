@@ -18,7 +18,7 @@ from raytac.world.world_model import WorldModel
 
 
 class RigidReadings:
-    """Wrenches, overlaps and surfaces of all rigid pads of a world, B environments, from an engine's present poses."""
+    """Wrenches, overlaps and surfaces of all rigid pads of a world, from an engine's poses."""
 
     soft = None
     meshes: tuple[str, ...] = ()
@@ -33,7 +33,10 @@ class RigidReadings:
         self.report: dict[str, np.ndarray] = {}
 
     def check_beyond(self, envs: Sequence[int], pad_from_body: np.ndarray) -> None:
-        """Raise ``OverlapError`` where a body at poses (n, pads, bodies, 4, 4) is beyond a pad's bonded face."""
+        """Raise ``OverlapError`` where a body is beyond a pad's bonded face.
+
+        ``pad_from_body``: poses (n, pads, bodies, 4, 4), of the environments ``envs``.
+        """
         for row, pad, i in np.argwhere(self.contact.faces.pierced(pad_from_body)).tolist():
             rule = f"{self.bodies[i].name!r} starts beyond the face that the gel of {self._names[pad]!r} is bonded to"
             raise OverlapError(f"environment {envs[row]}: {rule}")
@@ -43,7 +46,7 @@ class RigidReadings:
         return self.contact.wrenches.numpy()[:, self._names.index(name)].copy()
 
     def overlap(self, env: int) -> list[tuple[str, str, float]]:
-        """Sensor, body and depth [m] of every overlap at the present poses; inf for a body beyond a pad's bonded face."""
+        """Sensor, body and depth [m] of every overlap at present; inf beyond a pad's bonded face."""
         poses = self._pad_from_body()[[env]]
         contacts = self.contact.search.contacts(poses, np.zeros(1, int), 0.0)
         depth = np.zeros(poses.shape[1:3])
@@ -52,7 +55,10 @@ class RigidReadings:
         return [(self._names[k], self.bodies[i].name, float(depth[k, i])) for k, i in np.argwhere(depth > 0.0).tolist()]
 
     def reading(self, name: str, grid: PadGrid, failed: np.ndarray, envs: Sequence[int] | None = None) -> PadReading:
-        """Surface and forces of one sensor on the nodes of ``grid``, for the environments named, one row each; None is all."""
+        """Surface and forces of one sensor on the nodes of ``grid``.
+
+        ``envs``: the environments, one row each; None is all.
+        """
         rows, index = np.arange(len(failed)) if envs is None else np.asarray(envs), self._names.index(name)
         pads, bodies = self.engine.read_poses()
         world_from_pad, failed = pads[rows], failed[rows]

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.gel.surface import PadGrid, chosen_envs
-from raytac.physics.base import PadReading
+from raytac.physics.base import PadReading, PhysicsConfig
 from raytac.robots.mount import MountedSensor
-from raytac.sensor import TactileSensor
+from raytac.sensor import SensorSettings, TactileSensor
 
 Read = Callable[[str, PadGrid, list[int] | None], PadReading]
 """Reading of a sensor on a grid, for the environments named; None is all."""
@@ -22,23 +22,25 @@ Read = Callable[[str, PadGrid, list[int] | None], PadReading]
 class SensorFrames:
     """Sensors of one model in B environments, and what they see."""
 
-    def __init__(self, mounted: Sequence[MountedSensor], *, num_envs: int, seed: int, **settings: Any) -> None:
+    def __init__(
+        self,
+        mounted: Sequence[MountedSensor],
+        *,
+        num_envs: int,
+        seed: int,
+        physics: PhysicsConfig | None = None,
+        **settings: Unpack[SensorSettings],
+    ) -> None:
         """Check the settings; sensors are made on first use.
 
         ``settings``: those of every ``TactileSensor``. Raises what that raises, but for a device without ray tracing.
         """
         self._mounted, self._num_envs, self._seed = tuple(mounted), num_envs, seed
-        self._settings = settings
+        self._settings: dict[str, Any] = {**settings, "physics": physics}
         self._made: dict[str, TactileSensor] = {}
         with warnings.catch_warnings(action="ignore"):  # the sensors that are kept warn
             for one in self._mounted:  # pads alone may run on a device that cannot trace rays
-                TactileSensor(one.spec, **{"seed": seed, "num_envs": num_envs, **settings, "device": "cpu"})
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of what every sensor was asked for."""
-        asked = self._settings["outputs"]
-        return (asked,) if isinstance(asked, str) else tuple(asked)
+                TactileSensor(one.spec, **{"seed": seed, "num_envs": num_envs, **self._settings, "device": "cpu"})
 
     @property
     def names(self) -> tuple[str, ...]:

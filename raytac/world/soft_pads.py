@@ -72,7 +72,7 @@ class SoftPads:
             OverlapError: bodies overlap at the start, or one of the solver's lies inside a case or a link.
         """
         self.composed, self.model, self._models, self._datas = composed, composed.model, models, tuple(datas)
-        assert composed.scene is not None, "a world of one's own has rigid pads"
+        assert composed.scene is not None, "a world of a given MuJoCo model has rigid pads"
         self._scene, level = composed.scene, physics.level or PADS[0]
         scene = self._scene
         pads = [

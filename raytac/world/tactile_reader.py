@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Unpack
 
 import mujoco
 import numpy as np
@@ -25,6 +25,7 @@ from raytac.world.world_model import checked_states, own_world_model
 if TYPE_CHECKING:
     from raytac.gel.surface import PadGrid
     from raytac.robots.mount import SensorChoice
+    from raytac.sensor import SensorSettings
     from raytac.world.touched import TouchChoice
 
 DEPTHS = ("force", "geometry")
@@ -65,7 +66,8 @@ class TactileReader:
         num_envs: int = 1,
         allow_overlap: Sequence[str] = (),
         keyframe: str | None = None,
-        **settings: Any,
+        seed: int = 0,
+        **settings: Unpack[SensorSettings],
     ) -> None:
         """Find sensors and bodies in the model.
 
@@ -75,7 +77,8 @@ class TactileReader:
             depth: one of ``DEPTHS``.
             num_envs: number of states B that are read together.
             allow_overlap, keyframe: as of ``TactileWorld``: at this start, or ``qpos0``, no gel may lie in a geom that is not touched.
-            settings: ``outputs``, ``markers``, ``optics``, ``resolution``, ``device``, ``pitch`` and ``seed`` of every sensor.
+            seed: of every random number.
+            settings: ``outputs``, ``markers``, ``optics``, ``resolution``, ``device`` and ``pitch`` of every sensor.
 
         Raises:
             InputError: no sensor, a gel that does not collide, and what ``TactileWorld`` refuses of bodies.
@@ -88,7 +91,7 @@ class TactileReader:
         )
         self.failed = np.zeros(num_envs, bool)
         sensors_, bodies = self.composed.sensors, self.composed.touched
-        self._frames = SensorFrames(sensors_, num_envs=num_envs, seed=settings.pop("seed", 0), **settings)
+        self._frames = SensorFrames(sensors_, num_envs=num_envs, seed=seed, **settings)
         shapes = [body.parts for body in bodies]
         self._surfaces = PadSurfaces({mounted.name: mounted.spec.gelpad for mounted in sensors_}, shapes, num_envs)
         self._faces = {mounted.name: BondedFaces.on_cpu([mounted.spec.gelpad], shapes) for mounted in sensors_}

@@ -1,4 +1,7 @@
-"""States of a ``TactileWorld`` on MuJoCo Warp: they, the gels and their contacts lie on one device, and results are copied when read."""
+"""Environments of a ``TactileWorld`` on MuJoCo Warp: one device holds them and their gels.
+
+Results are copied when they are read.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,10 @@ from raytac.world.world_state import constant_controls
 
 
 class WarpStates:
-    """B environments on MuJoCo Warp, with the members of ``CStates``; ``world`` is the part on the device."""
+    """B environments on MuJoCo Warp, with the members of ``CStates``.
+
+    ``world`` is the part on the device.
+    """
 
     def __init__(
         self,
@@ -38,7 +44,9 @@ class WarpStates:
         grids: Mapping[str, PadGrid],
         markers: MarkersConfig | None,
     ) -> None:
-        """States at the start; ``grids``: of the sensors whose heights, and ``markers``, ``read`` gives.
+        """Build the environments at their start.
+
+        ``grids``: of the sensors whose heights, and ``markers``, ``read`` gives.
 
         Raises:
             InputError: a keyframe with speeds, activations or mocap bodies; as ``WarpWorld`` and ``PadTouch``.
@@ -172,7 +180,10 @@ class WarpStates:
         self.pads.surfaces.reset(np.asarray(envs, int))
 
     def _checked_positions(self, envs: Sequence[int], joints: np.ndarray | None, bodies: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Positions (B, nq), those of the start where an environment is not named. Raises ``OverlapError`` beyond a gel's bonded face."""
+        """Positions (B, nq), those of the start where an environment is not named.
+
+        Raises ``OverlapError`` for a body beyond a gel's bonded face.
+        """
         data, at = self._scratch, self._indices
         qpos = np.repeat(self.composed.start[None], self.world.engine.num_envs, axis=0)
         poses = np.zeros((len(envs), len(at.sites), len(at.bodies), 4, 4))

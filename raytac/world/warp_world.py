@@ -36,9 +36,9 @@ _SPRINGS = ("joints", "speed", "bias", "mass")
 
 
 class WarpWorld:
-    """B environments of a model with rigid pads; arms with torque motors follow targets by springs.
+    """B environments of a model with rigid pads on MuJoCo Warp.
 
-    The springs obey the law of ``JointImpedance``.
+    Arms with torque motors follow targets by springs, which obey the law of ``JointImpedance``.
 
     A control step is launched without waiting for the device, on CUDA as one graph. An environment in which physics breaks down, or a
     body goes through a pad, is no longer active until it is reset.
@@ -71,8 +71,8 @@ class WarpWorld:
                 follows no targets then.
             device: "auto", "cpu" or "cuda".
             frequency: of the springs in the joints [rad/s].
-            launches: steps of MuJoCo in a control step, as many as the scene's if None. Of more a world divides one in which something
-                moves fast near a pad.
+            launches: steps of MuJoCo in a control step, as many as the scene's if None. With more, a world divides a step in
+                which something moves fast near a pad.
             contacts, rows: memory for contacts and constraint rows, an environment each; None is a guess.
 
         Raises:

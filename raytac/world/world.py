@@ -36,7 +36,7 @@ from raytac.world.world_state import Control, WorldState
 
 if TYPE_CHECKING:
     from raytac.markers import MarkersConfig
-    from raytac.optics.base import OpticsConfig
+    from raytac.optics.base import OpticalMode, OpticsConfig
     from raytac.physics.soft.scene import SoftScene
     from raytac.robots.mount import SensorChoice
     from raytac.world.touched import TouchChoice
@@ -61,11 +61,11 @@ class TactileWorld:
         mount(spec, "gelsight_mini", site="left_tip", name="left")  # on a MuJoCo model of your own
         world = TactileWorld(spec, touches=["cube"], control_timestep=0.02, num_envs=8)
 
-    A model of one's own keeps its options, and moves to the bit as MuJoCo alone moves it while no pad is touched. Only MuJoCo's automatic
-    reset is disabled, since an environment that breaks down is marked in ``failed``. The model is copied.
+    A MuJoCo model that is given keeps its options, and moves to the bit as MuJoCo alone moves it while no pad is touched. Only MuJoCo's
+    automatic reset is disabled, since an environment that breaks down is marked in ``failed``. The model is copied.
 
     Attributes:
-        scene: the task scene; None of a model of one's own.
+        scene: the task scene; None if a MuJoCo model was given.
         physics: configuration that is used.
         model: MuJoCo's model of the scene.
         engine: settings of MuJoCo Warp; None is C MuJoCo.
@@ -87,7 +87,7 @@ class TactileWorld:
         coupling: str | None = None,
         outputs: Sequence[str] | str = ("rgb", "wrench"),
         markers: str | MarkersConfig | None = None,
-        optics: str | OpticsConfig[Any] = "raytrace",
+        optics: str | OpticsConfig[OpticalMode] = "raytrace",
         resolution: tuple[int, int] | str | None = None,
         num_envs: int = 1,
         engine: str | WarpEngine = "mujoco",
@@ -138,9 +138,7 @@ class TactileWorld:
             rule = "must be a task scene, its name or path, a mujoco.MjSpec or a mujoco.MjModel"
             raise InputError("scene", value=type(scene).__name__, rule=rule)
         if isinstance(scene, (str, Path)) and Path(scene).suffix.lower() in (".xml", ".mjcf", ".urdf", ".mjb"):
-            rule = (
-                "is no task scene: a model of one's own is given as mujoco.MjSpec.from_file(path), with sensors by raytac.mount"
-            )
+            rule = "is no task scene: give a MuJoCo model as mujoco.MjSpec.from_file(path), with sensors by raytac.mount"
             raise InputError("scene", value=scene, rule=rule)
         for given, value in own.items():
             if value is not None and not is_own:
@@ -151,7 +149,7 @@ class TactileWorld:
         if name not in WORLD_PADS.names:
             raise InputError("physics", value=name, rule="has pads for presses only, none for worlds", choices=WORLD_PADS.names)
         if is_own and self.physics.is_simulated:
-            rule = "needs a task scene: bodies of a model of one's own meet rigid pads"
+            rule = "needs a task scene: in other MuJoCo models pads are rigid"
             raise InputError("physics", value=name, rule=rule, choices=("rigid",))
         if isinstance(self.engine, WarpEngine) and self.physics.is_simulated:
             raise InputError("physics", value=name, rule="needs engine='mujoco': MuJoCo Warp has rigid pads", choices=("rigid",))
@@ -186,7 +184,7 @@ class TactileWorld:
         if isinstance(self.engine, WarpEngine):
             from raytac.world.warp_states import WarpStates
 
-            felt = "height" in self._frames.outputs or markers is not None
+            felt = "height" in ((outputs,) if isinstance(outputs, str) else outputs) or markers is not None
             grids = {one: sensor.grid for one, sensor in self._frames.sensors.items()} if felt else {}
             model = None if markers is None else markers_config(markers)
             self._states: CStates | WarpStates = WarpStates(
@@ -219,7 +217,10 @@ class TactileWorld:
 
     @property
     def data(self) -> tuple[mujoco.MjData, ...]:
-        """MuJoCo's state in every environment; raises ``InputError`` with MuJoCo Warp, whose states lie on a device."""
+        """MuJoCo's state in every environment.
+
+        Raises ``InputError`` with MuJoCo Warp, whose states lie on a device.
+        """
         return self._states.data
 
     @property
@@ -366,10 +367,10 @@ class TactileWorld:
             self._states.fail(failed)
 
     def read(self, name: str) -> WarpFrame:
-        """Readings of one sensor after the last step or reset, with MuJoCo Warp: arrays on the device.
+        """Readings of one sensor with MuJoCo Warp: arrays on the device.
 
-        Nothing is copied. The height is there if ``outputs`` or markers ask for it. Another gel that presses is not in it, as it is in
-        the frames of ``observe``.
+        They are those after the last step or reset, and nothing is copied. The height is there if ``outputs`` or markers ask for it.
+        Another gel that presses is not in it, as it is in the frames of ``observe``.
 
         Raises ``InputError`` for an unknown sensor, or with C MuJoCo.
         """

@@ -70,7 +70,10 @@ def check_controls(env: int, data: mujoco.MjData) -> None:
 
 
 def constant_controls(control: np.ndarray, num_envs: int, count: int) -> np.ndarray:
-    """Constant controls as (B, nu); ``count`` is nu. Raises ``InputError`` for another shape or a number that is not finite."""
+    """Constant controls as (B, nu); ``count`` is nu.
+
+    Raises ``InputError`` for another shape or a number that is not finite.
+    """
     values = np.asarray(control, float)
     if values.shape not in ((count,), (num_envs, count)):
         raise InputError("control", value=values.shape, rule=f"is its shape, which must be ({count},) or ({num_envs}, {count})")

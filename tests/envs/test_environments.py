@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import inspect
 import re
+import subprocess
+import sys
 import warnings
 from dataclasses import replace
 
@@ -65,6 +67,27 @@ def test_every_name_is_registered_alone_and_as_a_vector() -> None:
     assert isinstance(env.unwrapped, RollBallEnv) and "sensor_markers" not in env.observation_space.spaces  # type: ignore[attr-defined]
     many = gymnasium.make_vec("raytac/RollBall-v2", num_envs=3, vectorization_mode="vector_entry_point", tactile=None)
     assert isinstance(many.unwrapped, RollBallVectorEnv) and many.num_envs == 3
+
+
+_BY_NAME = """
+import sys, gymnasium
+try:
+    gymnasium.make("raytac/RollBall-v1")
+except gymnasium.error.NamespaceNotFound:
+    assert "raytac" not in sys.modules
+    print("needs an import")
+print(type(gymnasium.make("raytac.envs:raytac/RollBall-v1", tactile=None).unwrapped).__name__)
+print(gymnasium.make_vec("raytac.envs:raytac/RollBall-v1", 2, "vector_entry_point", tactile=None).num_envs)
+"""
+
+
+@pytest.mark.script
+def test_gymnasium_makes_it_without_an_import_of_ours() -> None:
+    """Only with the module before the colon: an entry point would be of no use since Gymnasium 1.0, as docs/rl.md says."""
+    run = subprocess.run([sys.executable, "-c", _BY_NAME], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    lines = [line for line in run.stdout.splitlines() if line in ("needs an import", "RollBallEnv", "2")]
+    assert lines == ["needs an import", "RollBallEnv", "2"]
 
 
 @pytest.mark.renderer

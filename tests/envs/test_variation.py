@@ -7,7 +7,7 @@ import pytest
 
 from raytac.envs import BalancePoleVectorEnv, PushCubeEnv, PushCubeVectorEnv, RollBallVectorEnv
 from raytac.envs.balance_pole import BalancePole
-from raytac.envs.batch import TaskBatch
+from raytac.envs.batch import TaskBatch, TaskOptions
 from raytac.envs.push_cube import PushCube
 from raytac.errors import InputError
 from raytac.observe import Randomization
@@ -180,7 +180,11 @@ def test_variations_that_cannot_be_are_told_and_change_nothing() -> None:
 
 @pytest.mark.slow
 def test_soft_pads_are_mounted_off_their_drawing_too_and_bodies_are_drawn_once() -> None:
-    options = {"physics": "ipc", "tactile": ("wrench",), "randomization": Randomization(pad_shift=3e-4, body_mass=0.3)}
+    options: TaskOptions = {
+        "physics": "ipc",
+        "tactile": ("wrench",),
+        "randomization": Randomization(pad_shift=3e-4, body_mass=0.3),
+    }
     many = RollBallVectorEnv(2, **options)
     many.reset(seed=3)
     pads = many.batch.world.state().world_from_pad["sensor"]
@@ -188,7 +192,8 @@ def test_soft_pads_are_mounted_off_their_drawing_too_and_bodies_are_drawn_once()
     models, ball = many.batch.world.models, many.batch.world.composed.bodies["ball"].index
     usual = RollBallVectorEnv(1, physics="rigid", tactile=None).batch.world.model.body_mass[ball]
     assert models[0].body_mass[ball] == models[1].body_mass[ball] != usual
-    rigid = RollBallVectorEnv(2, **{**options, "physics": "rigid"})
+    options["physics"] = "rigid"
+    rigid = RollBallVectorEnv(2, **options)
     rigid.reset(seed=3)
     np.testing.assert_allclose(pads, rigid.batch.world.state().world_from_pad["sensor"], atol=1e-9)
     seen = many.step(np.zeros((2, 3), np.float32))[0]

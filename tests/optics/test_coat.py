@@ -51,7 +51,7 @@ def lobe_alone(mi: Any, alpha: float, wi: np.ndarray, wo: np.ndarray) -> np.ndar
 def reflectance(mi: Any, coat: CoatSpec, wi: np.ndarray, wo: np.ndarray) -> np.ndarray:
     """f (3, n) of the fast integrator's formula."""
     normal = dr.zeros(mi.Normal3f, wi.shape[1]) + mi.Normal3f(0, 0, 1)
-    lobe = np.array(ggx(mi, coat.roughness, normal, mi.Vector3f(wi), mi.Vector3f(wo)))
+    lobe = np.array(ggx(coat.roughness, normal, mi.Vector3f(wi), mi.Vector3f(wo)))
     base = (1 - coat.specular) / np.pi * np.asarray(coat.reflectance)
     return base[:, None] + coat.specular * lobe[None]
 

@@ -30,8 +30,8 @@ def scene_of(*stages: StageSpec, at: np.ndarray | tuple[float, float] = (0.0, 0.
     return PressScene("press", shape, stages, source=Path("press.toml"))
 
 
-def pad_of(scene: PressScene, **options) -> RigidPad:
-    return RigidPad(MINI, scene, **{"pitch": 0.2e-3, **options})
+def pad_of(scene: PressScene, *, pitch: float = 0.2e-3, **options) -> RigidPad:
+    return RigidPad(MINI, scene, pitch=pitch, **options)
 
 
 def test_depth_is_compared_with_the_gel_under_the_object() -> None:

@@ -211,11 +211,11 @@ def direct_light(
                 gain *= field.visibility(seen.env, seen.p, target, tan_half, lit)
             diffuse += gain
             if specular and coat.specular > 0:
-                mirror += gain * ggx(mi, coat.roughness, seen.n, w, seen.wo)
+                mirror += gain * ggx(coat.roughness, seen.n, w, seen.wo)
     return diffuse, mirror
 
 
-def ggx(mi: Any, alpha: float, n: Any, wi: Any, wo: Any) -> Any:
+def ggx(alpha: float, n: Any, wi: Any, wo: Any) -> Any:
     """GGX reflectance D G / (4 cos θ_i cos θ_o) of a mirror (Walter et al. 2007, eq. 20, 33)."""
     h = dr.normalize(wi + wo)
     ci, co, ch = dr.dot(n, wi), dr.dot(n, wo), dr.dot(n, h)

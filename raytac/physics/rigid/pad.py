@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Unpack
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from raytac.gel.pyramid import ElasticSurround
 from raytac.gel.surface import GelSurface
 from raytac.gel.traction import foundation_traction
 from raytac.physics.base import PadReading
-from raytac.physics.press import CLEARANCE, PressPad
+from raytac.physics.press import CLEARANCE, PressPad, PressSettings
 from raytac.physics.rigid.load_law import LoadLaw, first_touch
 from raytac.physics.rigid.rig import PressRig
 from raytac.se3 import about_z
@@ -52,7 +52,7 @@ class RigidPad(PressPad):
     An ``indent`` to a depth moves the object there exactly; one to a force lets the drive push until the compliant contact balances it.
     """
 
-    def __init__(self, sensor: SensorSpec, scene: PressScene, **settings: Any) -> None:
+    def __init__(self, sensor: SensorSpec, scene: PressScene, **settings: Unpack[PressSettings]) -> None:
         """Build the grid, the object and the surround; ``settings`` and errors as of ``PressPad``."""
         if scene.object.dynamics == "soft":
             rule = "is for the soft pad, physics='ipc': the rigid pad's object does not give way"

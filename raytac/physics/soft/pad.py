@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property
-from typing import Any
+from typing import Unpack
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from raytac.gel.surface import GelSurface
 from raytac.gel.traction import CoatTraction
 from raytac.io.progress import Progress
 from raytac.physics.base import PadReading
-from raytac.physics.press import CLEARANCE, PressPad
+from raytac.physics.press import CLEARANCE, PressPad, PressSettings
 from raytac.physics.soft.bodies import object_body
 from raytac.physics.soft.mesh import PadMesh, pad_mesh
 from raytac.physics.soft.placement import PressPlacement
@@ -51,7 +51,7 @@ class SoftPad(PressPad):
         correction: Correction | None = DEFAULT_CORRECTION,
         control: PressControl = DEFAULT_CONTROL,
         device: str = "cpu",
-        **settings: Any,
+        **settings: Unpack[PressSettings],
     ) -> None:
         """Mesh the pad, make the object's surface and put both into the solver.
 

@@ -16,11 +16,15 @@ class WarpEngine:
     """Settings of MuJoCo Warp."""
 
     contacts: int | None = None
-    """Memory for contacts, an environment; None is a guess. Too little is an error that names the number to set."""
+    """Memory for contacts, an environment; None is a guess.
+
+    Too little is an error that names the number to set."""
     rows: int | None = None
     """Memory for constraint rows, an environment; None is a guess."""
     launches: int | None = None
-    """Steps of MuJoCo in a control step, the scene's or more: of more, a world divides one in which something moves fast near a pad."""
+    """Steps of MuJoCo in a control step, those of the scene or more; None is the scene's.
+
+    With more, a world divides a step in which something moves fast near a pad."""
 
 
 def checked_engine(engine: str | WarpEngine) -> WarpEngine | None:

@@ -247,8 +247,8 @@ class MujocoWarp:
     def advance(self, drive: Callable[[], None] = lambda: None, *, scene_steps: int = 1, launches: int | None = None) -> None:
         """Steps of the scene with the gels' contact, without the host; ``drive`` writes controls.
 
-        All worlds together take ``launches`` steps for them, as many as the scene's if None. Of more a world divides one in which something
-        moves fast near a pad.
+        All worlds together take ``launches`` steps for them, as many as the scene's if None. With more, a world divides a step in
+        which something moves fast near a pad.
         """
         count = scene_steps if launches is None else launches
         if count < scene_steps:
