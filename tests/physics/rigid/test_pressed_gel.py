@@ -1,4 +1,4 @@
-"""Undersides of all bodies by kernels: against the NumPy reference, and what they must not depend on."""
+"""The pressed gel by kernels: overlap against the NumPy reference, and what it must not depend on."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from raytac.errors import InputError
 from raytac.gel.surface import make_grid
-from raytac.physics.rigid.underside import Undersides
+from raytac.physics.rigid.pressed_gel import PressedGel
 from raytac.se3 import rotations
 from raytac.shapes.part import Part, primitive
 from raytac.shapes.underside import object_height
@@ -40,22 +40,24 @@ def test_union_of_bodies_equals_numpy(kind: str) -> None:
     bodies = [body_of(kind, rng), body_of("box", rng)]
     poses = np.stack([placed(body, rng) for body in bodies], axis=1)
     poses[::2, 1, 2, 3] += 0.1  # the box far away
-    found = Undersides(GRID, DOME.thickness, bodies, num_envs=8).of(poses, SOUND)
+    gel = PressedGel(GRID, DOME.thickness, bodies, num_envs=8)
+    found, overlap, windows = gel.of(poses, SOUND), gel.surround.overlap.numpy(), gel.surround.window.numpy()
     each = [reference(body, poses[:, i]) for i, body in enumerate(bodies)]
     expected = np.minimum(*each)
     # Triangles are found in float32, which may decide otherwise on their outline, and open ones are seen from both sides.
     exact = kind in PRIMITIVES or kind == "plane"
-    both = np.isfinite(expected) & np.isfinite(found.height)
-    assert (np.isfinite(expected) != np.isfinite(found.height)).mean() <= (0.0 if exact else 1e-3)
+    both = np.isfinite(expected) & (overlap > 0.0)
+    assert (np.isfinite(expected) != (overlap > 0.0)).mean() <= (0.0 if exact else 1e-3)
     assert both.any()
-    gap = np.abs(expected[both] - found.height[both])
+    gap = np.abs((GRID.rest - expected)[both] - overlap[both])
     assert np.quantile(gap, 1.0 if exact else 0.995) < 1e-10
     if exact:
         depth = np.stack([(GRID.rest - one).max(axis=(1, 2)) for one in each], axis=1)
         np.testing.assert_allclose(found.depth, depth, atol=1e-10)
         assert not found.behind.any()
-    for height, (left, right, top, bottom) in zip(found.height, found.window.tolist(), strict=True):
-        rows, columns = np.nonzero(np.isfinite(height))
+    np.testing.assert_array_equal(gel.surround.deepest.numpy(), overlap.max(axis=(1, 2)))
+    for one, (left, right, top, bottom) in zip(overlap, windows.tolist(), strict=True):
+        rows, columns = np.nonzero(one)
         spans = (columns.min(), columns.max() + 1, rows.min(), rows.max() + 1) if len(rows) else (0, 0, 0, 0)
         assert (left, right, top, bottom) == spans
 
@@ -64,22 +66,22 @@ def test_batch_equals_single_bit_for_bit_and_nothing_stays_from_before() -> None
     rng = np.random.default_rng(3)
     bodies = [body_of(kind, rng) for kind in ("box", "compound", "ball_mesh")]
     poses = np.stack([placed(body, rng) for body in bodies], axis=1)
-    under = Undersides(GRID, DOME.thickness, bodies, num_envs=2)
-    together = under.of(poses, SOUND)  # more than was reserved
-    kept = [np.array(values) for values in vars(together).values()]
+    gel = PressedGel(GRID, DOME.thickness, bodies, num_envs=8)
+    together = vars(gel.of(poses, SOUND))
+    assert together["contact"].any(axis=(1, 2)).all()
     for b in reversed(range(8)):
-        alone = under.of(poses[b : b + 1], SOUND[:1])
-        for values, one in zip(kept, vars(alone).values(), strict=True):
-            np.testing.assert_array_equal(values[b], one[0])
+        alone = gel.of(poses[b : b + 1], SOUND[:1])
+        for name, one in vars(alone).items():
+            np.testing.assert_array_equal(together[name][b], one[0], err_msg=name)
 
 
 def test_a_body_beyond_the_bonded_face_is_marked_and_not_shown() -> None:
     ball = [primitive("sphere", (2e-3,))]
     poses = np.tile(np.eye(4), (2, 1, 1, 1))
     poses[:, 0, 2, 3] = 1e-3, -DOME.thickness
-    found = Undersides(GRID, DOME.thickness, [ball], num_envs=2).of(poses, SOUND[:2])
+    found = PressedGel(GRID, DOME.thickness, [ball], num_envs=2).of(poses, SOUND[:2])
     np.testing.assert_array_equal(found.behind[:, 0], [False, True])
-    assert (found.height >= -DOME.thickness).all()
+    assert (found.height >= -DOME.thickness).all() and not found.lost.any()
 
 
 def test_failed_environments_and_poses_that_are_not_finite_show_nothing() -> None:
@@ -87,22 +89,26 @@ def test_failed_environments_and_poses_that_are_not_finite_show_nothing() -> Non
     poses = np.tile(np.eye(4), (3, 1, 1, 1))
     poses[:, 0, 2, 3] = 1e-3
     poses[1, 0, 0, 3] = np.nan
-    found = Undersides(GRID, DOME.thickness, [ball], num_envs=3).of(poses, np.array([True, True, False]))
-    np.testing.assert_array_equal(np.isfinite(found.height).any(axis=(1, 2)), [True, False, False])
+    found = PressedGel(GRID, DOME.thickness, [ball], num_envs=3).of(poses, np.array([True, True, False]))
+    np.testing.assert_array_equal(found.contact.any(axis=(1, 2)), [True, False, False])
+    np.testing.assert_array_equal(found.height[1], GRID.rest.astype(np.float32))
     np.testing.assert_array_equal(np.isfinite(found.depth[:, 0]), [True, False, False])
 
 
 def test_arrays_of_another_shape_are_refused() -> None:
-    under = Undersides(GRID, DOME.thickness, [[primitive("sphere", (2e-3,))]], num_envs=1)
+    gel = PressedGel(GRID, DOME.thickness, [[primitive("sphere", (2e-3,))]], num_envs=1)
     with pytest.raises(InputError, match="pad_from_body"):
-        under.of(np.eye(4)[None], SOUND[:1])
+        gel.of(np.eye(4)[None], SOUND[:1])
+    with pytest.raises(InputError, match="n at most 1"):
+        gel.of(np.tile(np.eye(4), (2, 1, 1, 1)), SOUND[:2])
     with pytest.raises(InputError, match="sound"):
-        under.of(np.eye(4)[None, None], SOUND)
+        gel.of(np.eye(4)[None, None], SOUND)
 
 
 def test_a_pad_without_bodies_is_at_rest() -> None:
-    found = Undersides(GRID, DOME.thickness, [], num_envs=2).of(np.zeros((2, 0, 4, 4)), SOUND[:2])
-    assert np.isinf(found.height).all() and found.depth.shape == (2, 0)
+    found = PressedGel(GRID, DOME.thickness, [], num_envs=2).of(np.zeros((2, 0, 4, 4)), SOUND[:2])
+    np.testing.assert_array_equal(found.height, np.broadcast_to(GRID.rest.astype(np.float32), found.height.shape))
+    assert not found.contact.any() and np.isnan(found.centre).all() and found.depth.shape == (2, 0)
 
 
 @pytest.mark.gpu
@@ -110,7 +116,11 @@ def test_cuda_equals_the_cpu() -> None:
     rng = np.random.default_rng(5)
     bodies = [body_of(kind, rng) for kind in KINDS]
     poses = np.stack([placed(body, rng) for body in bodies], axis=1)
-    cpu, cuda = (Undersides(GRID, DOME.thickness, bodies, num_envs=8, device=d).of(poses, SOUND) for d in ("cpu", "cuda"))
-    both = np.isfinite(cpu.height) & np.isfinite(cuda.height)
-    assert (np.isfinite(cpu.height) != np.isfinite(cuda.height)).mean() < 1e-3
-    assert np.quantile(np.abs(cpu.height[both] - cuda.height[both]), 0.995) < 1e-9
+    cpu, cuda = (PressedGel(GRID, DOME.thickness, bodies, num_envs=8, device=device) for device in ("cpu", "cuda"))
+    one, other = cpu.of(poses, SOUND), cuda.of(poses, SOUND)
+    overlaps = cpu.surround.overlap.numpy(), cuda.surround.overlap.numpy()
+    both = (overlaps[0] > 0.0) & (overlaps[1] > 0.0)
+    assert ((overlaps[0] > 0.0) != (overlaps[1] > 0.0)).mean() < 1e-3
+    assert np.quantile(np.abs(overlaps[0][both] - overlaps[1][both]), 0.995) < 1e-9
+    assert np.quantile(np.abs(one.height - other.height), 0.99) < 1e-9 and (one.contact != other.contact).mean() < 1e-3
+    np.testing.assert_allclose(other.centre, one.centre, rtol=0.0, atol=1e-5)
