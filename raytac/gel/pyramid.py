@@ -13,7 +13,7 @@ from raytac.gel import surround_kernels as kernels
 from raytac.gel.components import boxes
 from raytac.gel.gaussian import CONTACT_SCALE, FINAL_SIGMA, PYRAMID_SIGMAS, gaussian_matrix
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.warp_runtime import Recorded, start_warp
+from raytac.warp_runtime import HostArrays, Recorded, start_warp
 
 CONTACT_RULES = ("unilateral", "threshold")
 _FINEST = 0.2
@@ -134,9 +134,8 @@ class ElasticSurround:
 
     def _surface(self, under: np.ndarray) -> tuple[np.ndarray, ...]:
         """Height, contact and its centre of at most ``num_envs`` environments."""
-        arrays, views, launch = self._host
-        overlap, window, deepest = views
-        count = len(under)
+        inputs, launch = self._host
+        (overlap, window, deepest), count = inputs.values, len(under)
         u = overlap[:count]
         np.subtract(self.grid.rest, under, out=u, casting="same_kind")
         deepest[:count] = u.max(axis=(1, 2))
@@ -144,25 +143,24 @@ class ElasticSurround:
         np.maximum(u, np.float32(0.0), out=u)
         window[count:], window[:count] = 0, boxes(u > 0.0)
         window[:count][failed] = 0
-        for array, values in zip(arrays, views, strict=True):
-            if not array.device.is_cpu:  # there they are the arrays themselves
-                array.assign(values)
+        inputs.write()
         launch()
         height, contact, centre, lost = self.results(count)
         height[lost | failed] = np.nan
         return height, contact, centre
 
     @cached_property
-    def _host(self) -> tuple[tuple[wp.array, ...], tuple[np.ndarray, ...], Recorded]:
-        """What ``launch`` reads, also for NumPy, and ``launch`` recorded."""
-        arrays = self.overlap, self.window, self.deepest
-        return arrays, tuple(array.numpy() for array in arrays), Recorded(self.launch, device=self.device)
+    def _host(self) -> tuple[HostArrays, Recorded]:
+        """What ``launch`` reads, and ``launch`` recorded."""
+        return HostArrays(self.overlap, self.window, self.deepest), Recorded(self.launch, device=self.device)
+
+    @cached_property
+    def _results(self) -> HostArrays:
+        return HostArrays(self.height, self.contact, self.centre, self.lost)
 
     def results(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Copies of height, contact, centre and ``lost`` of the first environments."""
-        height, contact, centre, lost = (
-            array.numpy()[:count].copy() for array in (self.height, self.contact, self.centre, self.lost)
-        )
+        height, contact, centre, lost = (values[:count].copy() for values in self._results.read())
         return height, contact.view(bool), centre, lost != 0
 
     def clear(self) -> None:

@@ -16,6 +16,8 @@ from raytac.physics.rigid.search import PadSearch
 from raytac.shapes.part import Part, mesh_part
 from raytac.specs.sensor import GelpadSpec
 
+_WIDER = 1e-5
+"""Share by which a gel that is shown is wider, so that rounding does not leave out nodes on the edge of one of the same size."""
 _PITCH = 0.8e-3
 """Spacing of the vertices of a gel's surface [m]; a dome of 100 mm is off by 1 µm."""
 
@@ -26,7 +28,7 @@ class GelPairs:
     def __init__(self, gels: Sequence[GelpadSpec], bodies: np.ndarray, num_envs: int, *, device: str = "cpu") -> None:
         """``bodies`` (pads,): indices of the bodies that carry the pads."""
         parts = [(_gel_part(gel),) for gel in gels] if len(gels) > 1 else []
-        self._parts = parts
+        self._shown = [(_gel_part(gel, 1.0 + _WIDER),) for gel in gels] if len(gels) > 1 else []
         self.pairs: list[tuple[int, int, PadSearch]] = [
             (i, j, PadSearch([gels[i]], [parts[j]], num_envs=num_envs, device=device))
             for i in range(len(gels))
@@ -40,14 +42,14 @@ class GelPairs:
         """Gels of all pads as ``PressedGel`` takes them, 0 for those that ``pad`` does not touch; empty if it touches none."""
         others = {i + j - pad for i, j, _ in self.pairs if pad in (i, j)}
         shares = [k in others and self._modulus[k] / (self._modulus[pad] + self._modulus[k]) for k in range(len(self._modulus))]
-        return [(parts, float(share)) for parts, share in zip(self._parts, shares, strict=True)] if others else []
+        return [(parts, float(share)) for parts, share in zip(self._shown, shares, strict=True)] if others else []
 
 
-def _gel_part(gelpad: GelpadSpec) -> Part:
-    """The gel at rest as a closed mesh, pad frame."""
+def _gel_part(gelpad: GelpadSpec, scale: float = 1.0) -> Part:
+    """The gel at rest as a closed mesh, pad frame; ``scale``: of its width."""
     grid = make_grid(gelpad, _PITCH)
     ny, nx = grid.shape
-    x, y = (values.ravel() for values in np.meshgrid(grid.x, grid.y))
+    x, y = (scale * values.ravel() for values in np.meshgrid(grid.x, grid.y))
     top, back = np.stack([x, y, grid.rest.ravel()], axis=1), np.stack([x, y, np.full(x.size, -gelpad.thickness)], axis=1)
     node = np.arange(ny * nx).reshape(ny, nx)
     a, b, c, d = (node[rows, columns].ravel() for rows in (slice(-1), slice(1, None)) for columns in (slice(-1), slice(1, None)))

@@ -67,8 +67,9 @@ class PadSurfaces:
         """
         count, bodies = len(pad_from_body), len(self._bodies)
         shown = self._gel(name, grid, count).of(pad_from_body, ~failed)
-        lost, depth, behind = shown.lost | failed, shown.depth[:, :bodies], np.flatnonzero(shown.behind.any(axis=1))
-        if len(behind):
+        lost, depth = shown.lost | failed, shown.depth[:, :bodies]
+        if shown.behind.any():
+            behind = np.flatnonzero(shown.behind.any(axis=1))
             pierced = self._face(name).pierced(pad_from_body[behind, None, :bodies])[:, 0] & shown.behind[behind, :bodies]
             depth[behind] = np.where(pierced, -np.inf, depth[behind])
             lost[behind] |= pierced.any(axis=1)
@@ -83,11 +84,19 @@ class PadSurfaces:
         poses[(pressed != before) & (before >= 0) & ~failed] = np.nan
         self._pressed[name][rows] = np.where(failed, before, pressed)
         height, contact, centre = shown.height, shown.contact, shown.centre
-        height[lost], contact[lost], centre[lost] = np.nan, False, np.nan
-        wrench = np.where(lost[:, None], np.nan, wrench)
+        if lost.any():
+            height[lost], contact[lost], centre[lost] = np.nan, False, np.nan
+            wrench = np.where(lost[:, None], np.nan, wrench)
         sheared = None if shear is None else ContactShear.where(lost, shear(pressed))
         surface = GelSurface(grid, height, contact, centre, poses)
-        return PadReading(surface, wrench, lost, lambda surface: _traction(surface, wrench), shear=sheared)
+        force, torque = wrench[:, :3], wrench[:, 5]
+        return PadReading(
+            surface,
+            wrench,
+            lost,
+            lambda surface: foundation_traction(surface, force, torque, about_origin=True),
+            shear=sheared,
+        )
 
     def _gel(self, name: str, grid: PadGrid, count: int) -> PressedGel:
         """Gel of a sensor with memory for ``count`` environments."""
@@ -102,10 +111,3 @@ class PadSurfaces:
         if name not in self._faces:
             self._faces[name] = BondedFaces.on_cpu([self._gelpads[name]], self._bodies)
         return self._faces[name]
-
-
-def _traction(surface: GelSurface, wrench: np.ndarray) -> np.ndarray:
-    """Total forces of the pads distributed over their contacts (see ``foundation_traction``)."""
-    x, y = np.nan_to_num(surface.contact_centre).T
-    twist = wrench[:, 5] - (x * wrench[:, 1] - y * wrench[:, 0])
-    return foundation_traction(surface, wrench[:, :3], twist)

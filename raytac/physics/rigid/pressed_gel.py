@@ -16,7 +16,7 @@ from raytac.gel.surface import PadGrid
 from raytac.physics.rigid.shape_arrays import ShapeArrays
 from raytac.physics.rigid.underside_kernels import Before, Nodes, join_rows, lower, place
 from raytac.shapes.part import Part
-from raytac.warp_runtime import Recorded
+from raytac.warp_runtime import HostArrays, Recorded
 
 
 @dataclass(frozen=True)
@@ -99,19 +99,19 @@ class PressedGel:
             raise InputError("pad_from_body", value=pad_from_body.shape, rule=rule)
         if np.shape(sound) != (count,):
             raise InputError("sound", value=np.shape(sound), rule=f"must have shape ({count},), one for each pad")
-        arrays, (poses, active), launch = self._host
+        inputs, results, launch = self._host
+        poses, active = inputs.values
         poses[:count], active[:count], active[count:] = pad_from_body, sound, False
-        for array, values in zip(arrays, (poses, active), strict=True):
-            if not self.device.is_cpu:  # there they are the arrays themselves
-                array.assign(values)
+        inputs.write()
         launch()
-        depth, behind = (array.numpy()[:count].copy() for array in (self.depth, self.beyond))
-        return Pressed(*self.surround.results(count), depth, behind != 0)
+        depth, beyond = (values[:count].copy() for values in results.read())
+        return Pressed(*self.surround.results(count), depth, beyond != 0)
 
     @cached_property
-    def _host(self) -> tuple[tuple[wp.array, wp.array], tuple[np.ndarray, np.ndarray], Recorded]:
-        """What ``launch`` reads, also for NumPy, and ``launch`` recorded."""
-        return (self.poses, self.sound), (self.poses.numpy(), self.sound.numpy()), Recorded(self.launch, device=self.device)
+    def _host(self) -> tuple[HostArrays, HostArrays, Recorded]:
+        """What ``launch`` reads, what it finds for each body, and ``launch`` recorded."""
+        recorded = Recorded(self.launch, device=self.device)
+        return HostArrays(self.poses, self.sound), HostArrays(self.depth, self.beyond), recorded
 
     def launch(self) -> None:
         """Launch the kernels; nothing waits for the device."""

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from raytac.errors import InputError
+from raytac.gel.pyramid import ElasticSurround
 from raytac.gel.surface import make_grid
 from raytac.physics.rigid.pressed_gel import PressedGel
 from raytac.se3 import rotations
 from raytac.shapes.part import Part, primitive
 from raytac.shapes.underside import object_height
+from raytac.world.gel_pairs import GelPairs
 from tests.physics.rigid.test_pad_search import DOME, KINDS, PRIMITIVES, body_of
 
 GRID = make_grid(DOME, 0.4e-3)
@@ -109,6 +114,31 @@ def test_a_pad_without_bodies_is_at_rest() -> None:
     found = PressedGel(GRID, DOME.thickness, [], num_envs=2).of(np.zeros((2, 0, 4, 4)), SOUND[:2])
     np.testing.assert_array_equal(found.height, np.broadcast_to(GRID.rest.astype(np.float32), found.height.shape))
     assert not found.contact.any() and np.isnan(found.centre).all() and found.depth.shape == (2, 0)
+
+
+def test_another_gel_presses_by_its_share_also_beyond_the_bonded_face() -> None:
+    """Three gels, of which two are on one body; the stiffer one yields less. A ball between them is not shared."""
+    gels = [replace(DOME, youngs_modulus=DOME.youngs_modulus * factor) for factor in (1.0, 3.0, 1.0)]
+    pairs, ball = GelPairs(gels, np.array([0, 1, 0]), 2), [primitive("sphere", (2e-3,))]
+    assert [share for _, share in pairs.gels(0)] == [0.0, 0.75, 0.0] and [share for _, share in pairs.gels(1)] == [
+        0.25,
+        0.0,
+        0.25,
+    ]
+    assert GelPairs(gels[:2], np.array([0, 0]), 2).gels(0) == []
+    poses = np.tile(np.eye(4), (2, 4, 1, 1))
+    poses[:, 0, :3, 3] = 5e-3, 3e-3, 1.5e-3
+    poses[:, 2, :3, :3] = rotations(np.array([math.pi, 0.0, 0.0]))
+    poses[:, 2, :3, 3] = [(1e-3, 0.0, -0.4e-3), (1e-3, 0.0, -DOME.thickness - 0.5e-3)]
+    gel = PressedGel(GRID, DOME.thickness, [ball], gels=pairs.gels(0), num_envs=2)
+    found = gel.of(poses, SOUND[:2])
+    other, rigid = (object_height(parts, poses[:, k], GRID.x, GRID.y) for parts, k in ((pairs.gels(0)[1][0], 2), (ball, 0)))
+    expected = np.maximum(0.75 * np.maximum(GRID.rest - other, 0.0), np.maximum(GRID.rest - rigid, 0.0))
+    np.testing.assert_allclose(gel.surround.overlap.numpy(), expected, rtol=0.0, atol=1e-8)  # also along the edges
+    np.testing.assert_allclose(found.depth[:, 2], 0.75 * (GRID.rest - other).max(axis=(1, 2)), atol=1e-8)
+    assert np.isneginf(found.depth[:, [1, 3]]).all() and not found.behind.any()
+    surface = ElasticSurround(GRID, thickness=DOME.thickness).surface(GRID.rest - expected)
+    np.testing.assert_allclose(found.height[0], surface.height[0], rtol=0.0, atol=1e-8)
 
 
 @pytest.mark.gpu
