@@ -97,7 +97,7 @@ class ElasticSurround:
 
     def _allocate(self, num_envs: int) -> None:
         (ny, nx), lanes = self.grid.shape, self._lanes
-        count, packet = -(-nx // lanes), wp.types.vector(length=lanes, dtype=wp.float32)
+        count, (packet, mask) = -(-nx // lanes), kernels.packet_types(lanes)
         lines = kernels.ROWS * -(-ny // kernels.ROWS)
         rows = min(num_envs, max(_STACK // (ny * nx), 1)) if self.device.is_cpu else num_envs
         padded = np.zeros((ny, count * lanes), np.float32)
@@ -110,7 +110,7 @@ class ElasticSurround:
         self._moments = self._zeros((rows, ny), wp.vec2d)
         self.window, self.deepest = self._zeros((num_envs,), wp.vec4i), self._zeros((num_envs,), wp.float32)
         self._heights = self._zeros((num_envs, ny, count), packet)
-        self._contacts = self._zeros((num_envs, ny, count), wp.types.vector(length=lanes, dtype=wp.uint8))
+        self._contacts = self._zeros((num_envs, ny, count), mask)
         self.overlap, self.height, self.contact = (
             _nodes(packets)[:, :ny, :nx] for packets in (self._overlaps, self._heights, self._contacts)
         )
@@ -219,7 +219,7 @@ class _Gaussian:
         self.down = wp.array(np.ascontiguousarray(down.transpose(1, 0, 2)), dtype=wp.vec4f, device=device)
         """Weights of ``ROWS`` rows in a vector, (blocks, Ny)."""
         across, self.across_band = _blocks(along_x, lanes, device)
-        self.across = wp.array(across, dtype=wp.types.vector(length=lanes, dtype=wp.float32), device=device)
+        self.across = wp.array(across, dtype=kernels.packet_types(lanes)[0], device=device)
         """Weights of a packet of columns in a vector, (Nx, packets)."""
 
 

@@ -12,6 +12,7 @@ neither computed nor read there. ``first`` is the environment of the working arr
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import warp as wp
@@ -269,3 +270,17 @@ def without_lost(
             contact[env, j, p] = none
         if j == 0:
             centre[env] = wp.vec2d(_NAN, _NAN)
+
+
+@cache
+def packet_types(lanes: int) -> tuple[Any, Any]:
+    """Types of packets of heights and of contacts; the kernels for them are compiled together."""
+    packet, mask = (wp.types.vector(length=lanes, dtype=dtype) for dtype in (wp.float32, wp.uint8))
+    lines, fields, masks = wp.array2d(dtype=packet), wp.array3d(dtype=packet), wp.array3d(dtype=mask)
+    wp.overload(along_columns, {"source": fields, "out": fields})
+    wp.overload(along_rows, {"weights": lines, "overlap": fields, "out": fields})
+    wp.overload(impose, {"overlap": fields, "field": fields})
+    wp.overload(touch, {"overlap": fields, "field": fields, "contact": masks})
+    wp.overload(lift_off, {"rest": lines, "field": fields, "height": fields})
+    wp.overload(without_lost, {"rest": lines, "height": fields, "contact": masks})
+    return packet, mask

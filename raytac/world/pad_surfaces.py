@@ -73,15 +73,13 @@ class PadSurfaces:
             pierced = self._face(name).pierced(pad_from_body[behind, None, :bodies])[:, 0] & shown.behind[behind, :bodies]
             depth[behind] = np.where(pierced, -np.inf, depth[behind])
             lost[behind] |= pierced.any(axis=1)
-        poses, pressed = np.full((count, 4, 4), np.nan), np.full(count, -1)
-        if bodies:
-            deepest = depth.argmax(axis=1)
-            at = np.flatnonzero(depth[np.arange(count), deepest] > 0.0)
-            pressed[at] = deepest[at]
-            poses[at] = pad_from_body[at, pressed[at]]
-        # From one body to another is no motion of either.
+        pressed, poses = np.full(count, -1), np.full((count, 4, 4), np.nan)
         before = self._pressed[name][rows]
-        poses[(pressed != before) & (before >= 0) & ~failed] = np.nan
+        if bodies:
+            pressed = np.where(depth.max(axis=1) > 0.0, depth.argmax(axis=1), -1)
+            # From one body to another is no motion of either.
+            known = (pressed >= 0) & ((pressed == before) | (before < 0))
+            poses[known] = pad_from_body[known, pressed[known]]
         self._pressed[name][rows] = np.where(failed, before, pressed)
         height, contact, centre = shown.height, shown.contact, shown.centre
         if lost.any():

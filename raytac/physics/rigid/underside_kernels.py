@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from raytac.physics.rigid.motion_kernels import place_of, turn_of
 from raytac.physics.rigid.shape_kernels import Shapes, direction_of, first_hit, infinity, line_through, part_box
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -71,8 +72,7 @@ def place(
     """Place the parts of a body before a pad, by (pad, body)."""
     env, body = wp.tid()
     pose = poses[env, body]
-    turn = wp.mat33d(pose[0, 0], pose[0, 1], pose[0, 2], pose[1, 0], pose[1, 1], pose[1, 2], pose[2, 0], pose[2, 1], pose[2, 2])
-    origin = wp.vec3d(pose[0, 3], pose[1, 3], pose[2, 3])
+    turn, origin = turn_of(pose), place_of(pose)
     half_x, half_y = nodes.x[nodes.x.shape[0] - 1], nodes.y[nodes.y.shape[0] - 1]
     for part in range(shapes.first_part[body], shapes.first_part[body + 1]):
         rotation = turn * shapes.rotation[part]

@@ -14,17 +14,14 @@ import warp as wp
 
 from raytac.physics.rigid.motion_kernels import Frames
 from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
+from raytac.world.engine.shared_kernels import LEAST_FRICTION, correct_lift, is_among, is_box, slide_force
 from raytac.world.world_state import LARGEST_SPEED
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _ROWS = wp.constant(wp.int32(ROWS))
-_LEAST = wp.constant(wp.float64(1e-6))
-"""Least coefficient of friction, which MuJoCo wants positive."""
 _BACK = wp.constant(wp.float64(0.1))
 """Share of a penetration that a step takes back."""
-_FITS = wp.constant(wp.float64(0.005))
-"""Error of a lift over the normal force that is left."""
 _BESIDE = wp.constant(wp.float64(1e-4))
 """Distance from a box from which a point of a gap is not on it [m]."""
 _OPEN = wp.constant(wp.float64(2e-5))
@@ -202,7 +199,7 @@ def write_contacts(memory: Memory, steps: Steps, slots: Slots, gels: wp.array(dt
                     m += 1
                 m = wp.int32(0)
                 while m < _ROWS - 1:
-                    contact[first + memory.friction + m] = wp.max(slots.friction[i, pad, body, m], _LEAST)
+                    contact[first + memory.friction + m] = wp.max(slots.friction[i, pad, body, m], LEAST_FRICTION)
                     m += 1
                 integer[2 * first + memory.geom1] = gels[pad]
                 integer[2 * first + memory.geom2] = others[body]
@@ -236,16 +233,8 @@ def write_regularisation(memory: Memory, steps: Steps, slots: Slots):
                     m += 1
                 # The solver's cone is that of the dual one with the rows scaled by √R.
                 ratio = slots.regularisation[i, pad, body, 1] / slots.regularisation[i, pad, body, 0]
-                contact[k + memory.mu] = wp.max(slots.friction[i, pad, body, 0], _LEAST) * wp.sqrt(ratio)
+                contact[k + memory.mu] = wp.max(slots.friction[i, pad, body, 0], LEAST_FRICTION) * wp.sqrt(ratio)
                 k += memory.size
-
-
-@wp.func
-def is_among(geoms: wp.array(dtype=wp.int32), geom: wp.int32) -> wp.int32:
-    """Entry of a geom; 0 of −1, which is a flex."""
-    if geom < 0:
-        return 0
-    return geoms[geom]
 
 
 @wp.func
@@ -261,14 +250,6 @@ def row_times(memory: Memory, env: wp.int32, row: wp.int32, values: wp.array(dty
         for k in range(memory.nv):
             result += jacobian[row * memory.nv + k] * values[k]
     return result
-
-
-@wp.func
-def is_box(boxes: wp.array(dtype=wp.vec3d), geom: wp.int32) -> wp.bool:
-    """False of −1, which is a flex."""
-    if geom < 0:
-        return False
-    return boxes[geom][0] > wp.float64(0.0)
 
 
 @wp.func
@@ -351,8 +332,7 @@ def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(
 def correct_lifts(memory: Memory, steps: Steps, slots: Slots):
     """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step.
 
-    A slide that is faster by a lift that is larger asks for more: the first guess follows from the contact's own mass, the others by
-    secants. ``steps.slides`` stays 1 until the lift fits.
+    ``steps.slides`` stays 1 until all fit.
     """
     i = wp.tid()
     if steps.slides[i] == 0 or steps.lost[i] != 0:
@@ -370,32 +350,17 @@ def correct_lifts(memory: Memory, steps: Steps, slots: Slots):
     for pad in range(slots.held.shape[1]):
         for body in range(slots.held.shape[2]):
             if slots.held[i, pad, body] != 0:
-                lift = slots.lift[i, pad, body]
-                regular, sheared = slots.regularisation[i, pad, body, 0], slots.regularisation[i, pad, body, 1]
-                friction, ratio = wp.max(slots.friction[i, pad, body, 0], _LEAST), sheared / regular
-                ahead = before[row] + step * row_times(memory, env, row, acceleration)
-                normal = wp.max(slots.force[i, pad, body, 0] + lift - ahead / (regular * step), _0)
-                total = wp.float64(0.0)
+                ahead, total = before[row] + step * row_times(memory, env, row, acceleration), wp.float64(0.0)
                 m = wp.int32(1)
                 while m < _ROWS:
-                    ahead = before[row + m] + step * row_times(memory, env, row + m, acceleration)
-                    part = slots.force[i, pad, body, m] - ahead / (slots.regularisation[i, pad, body, m] * step)
-                    part *= friction / wp.max(slots.friction[i, pad, body, m - 1], _LEAST)
-                    total += part * part
+                    slide = before[row + m] + step * row_times(memory, env, row + m, acceleration)
+                    force = slide_force(slots, i, pad, body, m, slide, step)
+                    total += force * force
                     m += 1
-                lacks = friction * ratio * wp.max(wp.sqrt(total) - friction * normal, _0) - lift
-                if wp.abs(lacks) > _FITS * normal:
+                lacks, less = correct_lift(slots, i, pad, body, ahead, wp.sqrt(total), step)
+                if lacks:
                     slides = 1
-                    tried = slots.tried[i, pad, body]
-                    square = friction * friction * ratio
-                    more = lacks * (_1 + square * slots.compliance[i, pad, body] / sheared / (_1 + square))
-                    if not wp.isnan(tried[0]) and tried[1] != lacks:
-                        more = lacks * (lift - tried[0]) / (tried[1] - lacks)
-                    slots.tried[i, pad, body] = wp.vec2d(lift, lacks)
-                    more = wp.max(more, -lift)
-                    slots.lift[i, pad, body] = lift + more
-                    slots.force[i, pad, body, 0] = slots.force[i, pad, body, 0] - more
-                    reference[row] = reference[row] - more * regular
+                    reference[row] = reference[row] - less
                 row += _ROWS
     steps.slides[i] = slides
 

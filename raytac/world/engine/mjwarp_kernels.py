@@ -17,6 +17,7 @@ import warp as wp
 
 from raytac.physics.rigid.motion_kernels import Frames
 from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
+from raytac.world.engine.shared_kernels import LEAST_FRICTION, correct_lift, is_among, is_box, slide_force
 from raytac.world.world_state import LARGEST_SPEED
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -24,12 +25,8 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
 
 _ROWS = wp.constant(wp.int32(ROWS))
-_LEAST = wp.constant(wp.float64(1e-6))
-"""Least coefficient of friction, which MuJoCo wants positive."""
 _BACK = wp.constant(wp.float32(0.1))
 """Share of a penetration that a step takes back."""
-_FITS = wp.constant(wp.float64(0.005))
-"""Error of a lift over the normal force that is left."""
 _BESIDE = wp.constant(wp.float32(1e-4))
 """Distance from a box from which a point of a gap is not on it [m]."""
 _OPEN = wp.constant(wp.float32(2e-5))
@@ -309,7 +306,7 @@ def append_contacts(
             axes[m, n] = wp.float32(factor * frame[m, n])
     for m in range(5):
         factor = wp.where(is_scaled(m + 1), t, _1)
-        friction[m] = wp.float32(wp.max(slots.friction[i, pad, body, m], _LEAST) / factor)
+        friction[m] = wp.float32(wp.max(slots.friction[i, pad, body, m], LEAST_FRICTION) / factor)
     worlds.pos[k] = wp.vec3(wp.float32(place[0]), wp.float32(place[1]), wp.float32(place[2]))
     worlds.frame[k] = axes
     worlds.friction[k] = friction
@@ -351,14 +348,6 @@ def write_rows(worlds: Worlds, steps: Steps, slots: Slots, own: Own):
 
 
 @wp.func
-def is_among(geoms: wp.array(dtype=wp.int32), geom: wp.int32) -> wp.int32:
-    """Entry of a geom; 0 of −1, which is a flex."""
-    if geom < 0:
-        return 0
-    return geoms[geom]
-
-
-@wp.func
 def row_times(worlds: Worlds, i: wp.int32, row: wp.int32, values: wp.array2d(dtype=wp.float32)) -> wp.float64:
     """A row of the constraint's Jacobian times a vector of the degrees of freedom."""
     result = wp.float64(0.0)
@@ -370,14 +359,6 @@ def row_times(worlds: Worlds, i: wp.int32, row: wp.int32, values: wp.array2d(dty
         for k in range(worlds.nv):
             result += wp.float64(worlds.J[i, row, k]) * wp.float64(values[i, k])
     return result
-
-
-@wp.func
-def is_box(boxes: wp.array(dtype=wp.vec3), geom: wp.int32) -> wp.bool:
-    """False of −1, which is a flex."""
-    if geom < 0:
-        return False
-    return boxes[geom][0] > wp.float32(0.0)
 
 
 @wp.func
@@ -455,8 +436,7 @@ def begin_correction(worlds: Worlds, steps: Steps, own: Own):
 def correct_lifts(worlds: Worlds, own: Own, steps: Steps, slots: Slots):
     """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step.
 
-    A slide that is faster by a lift that is larger asks for more: the first guess follows from the contact's own mass, the others by
-    secants. ``steps.slides`` stays 1 until the lift fits.
+    ``steps.slides`` stays 1 until all fit.
     """
     i, pad, body = wp.tid()
     k = own.contact[i, pad, body]
@@ -465,31 +445,17 @@ def correct_lifts(worlds: Worlds, own: Own, steps: Steps, slots: Slots):
     row = worlds.efc_address[k, 0]
     if row < 0 or worlds.efc_address[k, _ROWS - 1] < 0:
         return
-    step, t, lift = steps.length[i], own.scale[i, pad, body], slots.lift[i, pad, body]
-    regular, sheared = slots.regularisation[i, pad, body, 0], slots.regularisation[i, pad, body, 1]
-    friction, ratio = wp.max(slots.friction[i, pad, body, 0], _LEAST), sheared / regular
+    step, t, total = steps.length[i], own.scale[i, pad, body], wp.float64(0.0)
     ahead = wp.float64(worlds.vel[i, row]) + step * row_times(worlds, i, row, worlds.qacc)
-    normal = wp.max(slots.force[i, pad, body, 0] + lift - ahead / (regular * step), _0)
-    total = wp.float64(0.0)
     for m in range(1, _ROWS):
         other, factor = worlds.efc_address[k, m] + 0, wp.where(is_scaled(m), t, _1)
-        ahead = (wp.float64(worlds.vel[i, other]) + step * row_times(worlds, i, other, worlds.qacc)) / factor
-        part = slots.force[i, pad, body, m] - ahead / (slots.regularisation[i, pad, body, m] * step)
-        part *= friction / wp.max(slots.friction[i, pad, body, m - 1], _LEAST)
-        total += part * part
-    lacks = friction * ratio * wp.max(wp.sqrt(total) - friction * normal, _0) - lift
-    if wp.abs(lacks) > _FITS * normal:
+        slide = (wp.float64(worlds.vel[i, other]) + step * row_times(worlds, i, other, worlds.qacc)) / factor
+        force = slide_force(slots, i, pad, body, m, slide, step)
+        total += force * force
+    lacks, less = correct_lift(slots, i, pad, body, ahead, wp.sqrt(total), step)
+    if lacks:
         wp.atomic_max(steps.slides, i, 1)
-        tried = slots.tried[i, pad, body]
-        square = friction * friction * ratio
-        more = lacks * (_1 + square * slots.compliance[i, pad, body] / sheared / (_1 + square))
-        if not wp.isnan(tried[0]) and tried[1] != lacks:
-            more = lacks * (lift - tried[0]) / (tried[1] - lacks)
-        more = wp.max(more, -lift)
-        slots.tried[i, pad, body] = wp.vec2d(lift, lacks)
-        slots.lift[i, pad, body] = lift + more
-        slots.force[i, pad, body, 0] = slots.force[i, pad, body, 0] - more
-        worlds.aref[i, row] = wp.float32(wp.float64(worlds.aref[i, row]) - more * regular)
+        worlds.aref[i, row] = wp.float32(wp.float64(worlds.aref[i, row]) - less)
 
 
 @wp.kernel
