@@ -62,7 +62,7 @@ class HostArrays:
     """Warp arrays for NumPy: on the CPU the arrays themselves, on CUDA copies."""
 
     def __init__(self, *arrays: wp.array) -> None:
-        self._arrays, self._on_cpu = arrays, all(array.device.is_cpu for array in arrays)
+        self._arrays, self._on_cpu = arrays, all(wp.get_device(array.device).is_cpu for array in arrays)
         self.values: tuple[np.ndarray, ...] = tuple(array.numpy() for array in arrays)
 
     def read(self) -> tuple[np.ndarray, ...]:

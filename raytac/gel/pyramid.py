@@ -88,9 +88,10 @@ class ElasticSurround:
         self._scale = contact_scale if contact_rule == "threshold" else -1.0
         self._lowest, self._shallow = float(-thickness - _FACE), float(thickness + grid.rest.min())
         finest = _FINEST * min(grid.pitch)
-        self._pyramid = [_Gaussian(grid, sigma, self._lanes, self.device) for sigma in sigmas if sigma > finest]
+        widths = [sigma for sigma in sigmas if sigma > finest] or [0.0]
+        self._pyramid = [_Gaussian(grid, sigma, self._lanes, self.device) for sigma in widths]
         self._final = _Gaussian(grid, final_sigma, self._lanes, self.device) if final_sigma > finest else None
-        spread = np.cumsum([s**2 for s in (*sigmas, final_sigma) if s > finest])
+        spread = np.cumsum(np.square([*widths, final_sigma]))
         self._reaches = [np.ceil(_REACH * np.sqrt(one) / grid.pitch).astype(int) + 2 for one in spread]
         """Nodes along x and y that each Gaussian, with those before, reaches."""
         self._allocate(num_envs)
@@ -112,7 +113,7 @@ class ElasticSurround:
         self._heights = self._zeros((num_envs, ny, count), packet)
         self._contacts = self._zeros((num_envs, ny, count), mask)
         self.overlap, self.height, self.contact = (
-            _nodes(packets)[:, :ny, :nx] for packets in (self._overlaps, self._heights, self._contacts)
+            _nodes(packets, ny, nx) for packets in (self._overlaps, self._heights, self._contacts)
         )
         self._spare_nodes = _nodes(self._spare)
         self.centre, self.lost = self._zeros((num_envs,), wp.vec2d), self._zeros((num_envs,), wp.int32)
@@ -124,9 +125,8 @@ class ElasticSurround:
         ``raytac.shapes.underside``); ``pad_from_object`` (B, 4, 4) is passed on. An environment with NaN in it, or whose gel would lie
         below its bonded face, gets a surface of NaN without contact.
         """
-        count, parts = len(self.lost), []
-        for start in range(0, max(len(object_height), 1), count):
-            parts.append(self._surface(object_height[start : start + count]))
+        count, starts = len(self.lost), range(0, max(len(object_height), 1), len(self.lost))
+        parts = [self._surface(object_height[start : start + count]) for start in starts]
         height, contact, centre = (
             values[0] if len(parts) == 1 else np.concatenate(values) for values in zip(*parts, strict=True)
         )
@@ -233,10 +233,12 @@ def _blocks(matrix: np.ndarray, size: int, device: Any) -> tuple[np.ndarray, wp.
     return np.ascontiguousarray(padded.T).reshape(-1, count, size), wp.array(band, dtype=wp.vec2i, device=device)
 
 
-def _nodes(packets: wp.array) -> wp.array:
-    """An array of packets (B, n, m) node by node, (B, n, m · lanes), in the same memory."""
+def _nodes(packets: wp.array, rows: int | None = None, columns: int | None = None) -> wp.array:
+    """The first rows and columns of an array of packets (B, n, m), node by node, in the same memory; None is all."""
     *shape, count = packets.shape
     kind: Any = packets.dtype
-    nodes = wp.array(ptr=packets.ptr, shape=(*shape, count * kind._length_), dtype=kind._wp_scalar_type_, device=packets.device)
+    nodes: Any = wp.array(
+        ptr=packets.ptr, shape=(*shape, count * kind._length_), dtype=kind._wp_scalar_type_, device=packets.device
+    )
     nodes._packets = packets  # whose memory it is
-    return nodes
+    return nodes[:, :rows, :columns]

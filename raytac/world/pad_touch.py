@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import warp as wp
 
@@ -67,7 +68,7 @@ class PadTouch:
         gel.launch()
         wp.launch(lose_marked, dim=len(active), inputs=[gel.surround.lost, active], device=gel.device)
         if self.fots is not None:
-            depth = gel.depth[:, : self._bodies]
+            depth: Any = gel.depth[:, : self._bodies]
             self.fots.launch(self.height, self.contact, poses, self._pad, depth, active, contact.shear.struct)
 
     def reset(self, mask: wp.array) -> None:

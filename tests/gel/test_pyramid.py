@@ -169,6 +169,18 @@ def test_a_slab_over_the_whole_pad_has_a_centre(depth: float) -> None:
     np.testing.assert_allclose(surface.contact_centre[0], 0.0, atol=1e-9)
 
 
+@pytest.mark.parametrize("final", [0.0, 0.5e-3])
+def test_without_gaussians_the_surface_is_the_objects(final: float) -> None:
+    """Or with the last one alone; the contact is the overlap."""
+    grid = make_grid(PAD, 0.25e-3)
+    under = object_height([primitive("sphere", (4e-3,))], np.eye(4)[None], grid.x, grid.y) + 3.4e-3
+    surface = ElasticSurround(grid, sigmas=(), final_sigma=final).surface(under)
+    overlap = np.maximum(grid.rest - under[0], 0.0)
+    along_y, along_x = (gaussian_by_cosines(n, final / d) for n, d in zip(grid.shape, reversed(grid.pitch), strict=True))
+    np.testing.assert_allclose(surface.indentation[0], along_y @ overlap @ along_x.T, rtol=0.0, atol=2e-9)
+    np.testing.assert_array_equal(surface.contact[0], overlap > 0.0)
+
+
 def test_unknown_contact_rule_is_refused() -> None:
     with pytest.raises(InputError, match="unilateral"):
         ElasticSurround(make_grid(PAD, 0.5e-3), contact_rule="hard")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,7 +48,7 @@ class Both:
         reading = self.host.reading(
             "pad", self.grid, poses[:, None], np.zeros((count, 6)), np.zeros(count, bool), np.arange(count)
         )
-        moved = wp.array(np.stack([poses, poses], axis=1)[:, None], dtype=wp.mat44d, device=self.device)
+        moved: Any = wp.array(np.stack([poses, poses], axis=1)[:, None], dtype=wp.mat44d, device=self.device)
         wp.copy(gel.poses, moved[:, 0, :1])
         gel.sound.fill_(True)
         gel.launch()
