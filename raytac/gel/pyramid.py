@@ -151,7 +151,7 @@ class ElasticSurround:
 
     @cached_property
     def _host(self) -> tuple[HostArrays, Recorded]:
-        """What ``launch`` reads, and ``launch`` recorded."""
+        """Arrays that ``launch`` reads, and ``launch`` recorded."""
         return HostArrays(self.overlap, self.window, self.deepest), Recorded(self.launch, device=self.device)
 
     @cached_property

@@ -35,7 +35,7 @@ def packets(first: wp.int32, last: wp.int32, reach: wp.int32, lanes: wp.int32, c
 
 @wp.func
 def is_reached(j: wp.int32, box: wp.vec4i, reach: wp.int32):
-    """Whether one of ``ROWS`` rows from j on is in the box or ``reach`` around it."""
+    """True if one of ``ROWS`` rows from j on is in the box or ``reach`` around it."""
     return box[1] > 0 and j + ROWS > box[2] - reach and j < box[3] + reach
 
 

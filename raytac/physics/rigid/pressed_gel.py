@@ -109,18 +109,18 @@ class PressedGel:
 
     @cached_property
     def _host(self) -> tuple[HostArrays, HostArrays, Recorded]:
-        """What ``launch`` reads, what it finds for each body, and ``launch`` recorded."""
+        """Arrays that ``launch`` reads, results for each body, and ``launch`` recorded."""
         recorded = Recorded(self.launch, device=self.device)
         return HostArrays(self.poses, self.sound), HostArrays(self.depth, self.beyond), recorded
 
     def launch(self) -> None:
         """Launch the kernels; nothing waits for the device."""
-        (count, lines), surround, found = self._written.shape, self.surround, (self._written, self._depths, self._behind)
+        (count, lines), surround, by_row = self._written.shape, self.surround, (self._written, self._depths, self._behind)
         surround.clear()
         if self._count:
             self._launch(place, (count, self._count), [self.poses, self.sound, self._shapes.struct, self._nodes, self._before])
-            self._launch(lower, (count, lines), [self._shapes.struct, self._nodes, self._before, surround.overlap, *found])
-        self._launch(join_rows, (count,), [*found, surround.window, surround.deepest, self.depth, self.beyond])
+            self._launch(lower, (count, lines), [self._shapes.struct, self._nodes, self._before, surround.overlap, *by_row])
+        self._launch(join_rows, (count,), [*by_row, surround.window, surround.deepest, self.depth, self.beyond])
         surround.launch()
 
     def _zeros(self, *shape: int, dtype: Any) -> wp.array:
