@@ -14,23 +14,23 @@ import warp as wp
 
 from raytac.physics.rigid.motion_kernels import Frames
 from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
-from raytac.world.engine.shared_kernels import LEAST_FRICTION, correct_lift, is_among, is_box, slide_force
+from raytac.world.engine.shared_kernels import (
+    LEAST_FRICTION,
+    closing,
+    correct_lift,
+    is_among,
+    is_box,
+    is_open,
+    passes,
+    slide_force,
+)
 from raytac.world.world_state import LARGEST_SPEED
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _ROWS = wp.constant(wp.int32(ROWS))
-_BACK = wp.constant(wp.float64(0.1))
-"""Share of a penetration that a step takes back."""
-_BESIDE = wp.constant(wp.float64(1e-4))
-"""Distance from a box from which a point of a gap is not on it [m]."""
-_OPEN = wp.constant(wp.float64(2e-5))
-"""Gap [m] of a contact without friction before and after a step; load closes it nearer."""
-_FAR = wp.constant(wp.float64(1.0))
-"""Gap that no step closes [m]."""
 _SLOWEST = wp.constant(wp.float64(1e-9))
 """Least speed by which a gap is divided [m/s]."""
-_HALF = wp.constant(wp.float64(0.5))
 _LARGEST_SPEED = wp.constant(wp.float64(LARGEST_SPEED))
 _MANY = wp.constant(wp.int32(0x7FFFFFFF))
 _0 = wp.constant(wp.float64(0.0))
@@ -112,8 +112,13 @@ def vector(values: wp.array(dtype=wp.float64), index: wp.int32) -> wp.vec3d:
 
 
 @wp.func
+def matrix_at(values: wp.array(dtype=wp.float64), first: wp.int32) -> wp.mat33d:
+    return wp.matrix_from_rows(vector_at(values, first), vector_at(values, first + 3), vector_at(values, first + 6))
+
+
+@wp.func
 def matrix(values: wp.array(dtype=wp.float64), index: wp.int32) -> wp.mat33d:
-    return wp.matrix_from_rows(vector(values, 3 * index), vector(values, 3 * index + 1), vector(values, 3 * index + 2))
+    return matrix_at(values, 9 * index)
 
 
 @wp.func
@@ -252,28 +257,6 @@ def row_times(memory: Memory, env: wp.int32, row: wp.int32, values: wp.array(dty
     return result
 
 
-@wp.func
-def beside_box(memory: Memory, env: wp.int32, geom: wp.int32, half: wp.vec3d, point: wp.vec3d) -> wp.float64:
-    """Distance [m] of a point from a box, along the axis on which it is farthest out; 0 inside."""
-    turn = matrix(doubles(memory, env, memory.geom_xmat), geom)
-    local = wp.transpose(turn) * (point - vector(doubles(memory, env, memory.geom_xpos), geom))
-    return wp.max(wp.max(wp.abs(local[0]) - half[0], wp.abs(local[1]) - half[1]), wp.max(wp.abs(local[2]) - half[2], _0))
-
-
-@wp.func
-def passes(
-    memory: Memory, env: wp.int32, one: wp.int32, two: wp.int32, boxes: wp.array(dtype=wp.vec3d), near: wp.vec3d, far: wp.vec3d,
-    moved: wp.vec3d,
-) -> wp.bool:  # fmt: skip
-    """True if two boxes pass each other, so that their gap is no contact once it is closed.
-
-    Its points ``near`` and ``far`` are not on the boxes, or neither is on the other box once the second one has moved.
-    """
-    off = wp.max(beside_box(memory, env, one, boxes[one], near), beside_box(memory, env, two, boxes[two], far))
-    by = wp.min(beside_box(memory, env, one, boxes[one], far + moved), beside_box(memory, env, two, boxes[two], near - moved))
-    return wp.max(off, by) > _BESIDE
-
-
 @wp.kernel
 def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(dtype=wp.int32), boxes: wp.array(dtype=wp.vec3d)):
     """Set reference accelerations of the last rows and ``hard`` geoms, after MuJoCo's own.
@@ -295,24 +278,22 @@ def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(
         if first >= 0 and integer[at + memory.dim] >= 3 and is_among(hard, one) + is_among(hard, two) > 0:
             n = k * memory.size
             gap = contact[n + memory.dist]
-            # A gap is closed by the step exactly, and a penetration is taken back slowly.
-            wanted = wp.where(gap > _0, gap, _BACK * gap) / step
-            open = wp.bool(False)
+            open, passed = wp.bool(False), wp.bool(False)
             ahead, free = wp.vec3d(), wp.vec3d()
             if gap > _0:
                 for m in range(3):
                     free[m] = row_times(memory, env, first + m, smooth)
                     ahead[m] = velocity[first + m] + step * free[m]
-                open = gap > _OPEN and gap + step * ahead[0] > _OPEN
                 if is_box(boxes, one) and is_box(boxes, two):
-                    at = n + memory.frame
-                    frame = wp.matrix_from_rows(vector_at(contact, at), vector_at(contact, at + 3), vector_at(contact, at + 6))
-                    middle, shift = vector_at(contact, n + memory.pos), _HALF * gap * frame[0]
-                    until = wp.min(step, gap / wp.max(-ahead[0], _SLOWEST))
-                    moved = wp.transpose(frame) * wp.vec3d(-gap, until * ahead[1], until * ahead[2])
-                    if passes(memory, env, one, two, boxes, middle - shift, middle + shift, moved):
-                        wanted, open = _FAR / step, wp.bool(True)
-            reference[first] = -(velocity[first] + wanted) / step
+                    turns, places = doubles(memory, env, memory.geom_xmat), doubles(memory, env, memory.geom_xpos)
+                    passed = passes(
+                        matrix(turns, one), vector(places, one), boxes[one],
+                        matrix(turns, two), vector(places, two), boxes[two],
+                        vector_at(contact, n + memory.pos), matrix_at(contact, n + memory.frame),
+                        gap, ahead, wp.min(step, gap / wp.max(-ahead[0], _SLOWEST)),
+                    )  # fmt: skip
+                open = passed or is_open(gap, ahead[0], step)
+            reference[first] = -(velocity[first] + closing(gap, passed) / step) / step
             for m in range(1, 3):
                 # MuJoCo's cone acts across a gap that is smaller than the friction times the slide of the step.
                 reference[first + m] = wp.where(open, free[m], -velocity[first + m] / step)

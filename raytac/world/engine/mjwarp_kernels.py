@@ -17,7 +17,16 @@ import warp as wp
 
 from raytac.physics.rigid.motion_kernels import Frames
 from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
-from raytac.world.engine.shared_kernels import LEAST_FRICTION, correct_lift, is_among, is_box, slide_force
+from raytac.world.engine.shared_kernels import (
+    LEAST_FRICTION,
+    closing,
+    correct_lift,
+    is_among,
+    is_box,
+    is_open,
+    passes,
+    slide_force,
+)
 from raytac.world.world_state import LARGEST_SPEED
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -25,14 +34,6 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
 
 _ROWS = wp.constant(wp.int32(ROWS))
-_BACK = wp.constant(wp.float32(0.1))
-"""Share of a penetration that a step takes back."""
-_BESIDE = wp.constant(wp.float32(1e-4))
-"""Distance from a box from which a point of a gap is not on it [m]."""
-_OPEN = wp.constant(wp.float32(2e-5))
-"""Gap [m] of a contact without friction before and after a step; load closes it nearer."""
-_FAR = wp.constant(wp.float32(1.0))
-"""Gap that no step closes [m]."""
 _SLOWEST = wp.constant(wp.float32(1e-6))
 """Least speed by which a gap is divided [m/s]."""
 _LARGEST_SPEED = wp.constant(wp.float32(LARGEST_SPEED))
@@ -361,25 +362,6 @@ def row_times(worlds: Worlds, i: wp.int32, row: wp.int32, values: wp.array2d(dty
     return result
 
 
-@wp.func
-def beside_box(worlds: Worlds, i: wp.int32, geom: wp.int32, half: wp.vec3, point: wp.vec3) -> wp.float32:
-    """Distance [m] of a point from a box, along the axis on which it is farthest out; 0 inside."""
-    local = wp.transpose(worlds.geom_xmat[i, geom]) * (point - worlds.geom_xpos[i, geom])
-    out = wp.max(wp.abs(local[0]) - half[0], wp.abs(local[1]) - half[1])
-    return wp.max(out, wp.max(wp.abs(local[2]) - half[2], wp.float32(0.0)))
-
-
-@wp.func
-def passes(
-    worlds: Worlds, i: wp.int32, geom: wp.vec2i, boxes: wp.array(dtype=wp.vec3), near: wp.vec3, far: wp.vec3, moved: wp.vec3
-) -> wp.bool:
-    """As of ``c_kernels``."""
-    one, two = boxes[geom[0]], boxes[geom[1]]
-    off = wp.max(beside_box(worlds, i, geom[0], one, near), beside_box(worlds, i, geom[1], two, far))
-    by = wp.min(beside_box(worlds, i, geom[0], one, far + moved), beside_box(worlds, i, geom[1], two, near - moved))
-    return wp.max(off, by) > _BESIDE
-
-
 @wp.kernel
 def write_hard_references(
     worlds: Worlds, own: Own, hard: wp.array(dtype=wp.int32), boxes: wp.array(dtype=wp.vec3), timestep: wp.array(dtype=wp.float32)
@@ -396,9 +378,7 @@ def write_hard_references(
         return
     i = worlds.worldid[k]
     step, gap = timestep[i % timestep.shape[0]], worlds.dist[k]
-    # A gap is closed by the step exactly, and a penetration is taken back slowly.
-    wanted = wp.where(gap > wp.float32(0.0), gap, _BACK * gap) / step
-    open = wp.bool(False)
+    open, passed = wp.bool(False), wp.bool(False)
     ahead, free = wp.vec3(), wp.vec3()
     if gap > wp.float32(0.0):
         for m in range(3):
@@ -406,15 +386,14 @@ def write_hard_references(
             if other >= 0:
                 free[m] = wp.float32(row_times(worlds, i, other, worlds.qacc_smooth))
                 ahead[m] = worlds.vel[i, other] + step * free[m]
-        open = gap > _OPEN and gap + step * ahead[0] > _OPEN
         if is_box(boxes, geom[0]) and is_box(boxes, geom[1]):
-            frame = worlds.frame[k]
-            shift = wp.float32(0.5) * gap * frame[0]
-            until = wp.min(step, gap / wp.max(-ahead[0], _SLOWEST))
-            moved = wp.transpose(frame) * wp.vec3(-gap, until * ahead[1], until * ahead[2])
-            if passes(worlds, i, geom, boxes, worlds.pos[k] - shift, worlds.pos[k] + shift, moved):
-                wanted, open = _FAR / step, wp.bool(True)
-    worlds.aref[i, row] = -(worlds.vel[i, row] + wanted) / step
+            passed = passes(
+                worlds.geom_xmat[i, geom[0]], worlds.geom_xpos[i, geom[0]], boxes[geom[0]],
+                worlds.geom_xmat[i, geom[1]], worlds.geom_xpos[i, geom[1]], boxes[geom[1]],
+                worlds.pos[k], worlds.frame[k], gap, ahead, wp.min(step, gap / wp.max(-ahead[0], _SLOWEST)),
+            )  # fmt: skip
+        open = passed or is_open(gap, ahead[0], step)
+    worlds.aref[i, row] = -(worlds.vel[i, row] + closing(gap, passed) / step) / step
     for m in range(1, 3):
         other = worlds.efc_address[k, m]
         if other >= 0:
