@@ -6,6 +6,7 @@ from collections.abc import Callable
 from threading import RLock
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from raytac.installation import foreign_ipc
@@ -55,3 +56,23 @@ class Recorded:
         """Launch them."""
         with LAUNCH:
             wp.capture_launch(self._graph)
+
+
+class HostArrays:
+    """Warp arrays for NumPy: on the CPU the arrays themselves, on CUDA copies."""
+
+    def __init__(self, *arrays: wp.array) -> None:
+        self._arrays, self._on_cpu = arrays, all(wp.get_device(array.device).is_cpu for array in arrays)
+        self.values: tuple[np.ndarray, ...] = tuple(array.numpy() for array in arrays)
+
+    def read(self) -> tuple[np.ndarray, ...]:
+        """Present ``values``."""
+        if not self._on_cpu:
+            self.values = tuple(array.numpy() for array in self._arrays)
+        return self.values
+
+    def write(self) -> None:
+        """Bring what was written to ``values`` to the arrays."""
+        if not self._on_cpu:
+            for array, values in zip(self._arrays, self.values, strict=True):
+                array.assign(values)

@@ -149,7 +149,10 @@ class _SensorTouch:
             self._grid, self._images = sensor.grid, DeviceImages(plain, sensor)
         grid = self._grid
         bodies = [body.parts for body in world.composed.touched]
-        self.pad = PadTouch(spec, grid, bodies, markers, num_envs=count, patches=patches, device=str(device), pad=index)
+        gels = world.pairs.gels(index)
+        self.pad = PadTouch(
+            spec, grid, bodies, markers, gels=gels, pad=index, num_envs=count, patches=patches, device=str(device)
+        )
         self._height, self._contact = wp.to_torch(self.pad.height), wp.to_torch(self.pad.contact)
         self._rest = torch.tensor(grid.rest, dtype=torch.float32, device=generator.device)
         self._ink = None

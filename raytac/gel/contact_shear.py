@@ -27,6 +27,8 @@ class ContactShear:
     @staticmethod
     def where(failed: np.ndarray, shear: ContactShear) -> ContactShear:
         """``shear`` with NaN for environments that ``failed`` (B,)."""
+        if not failed.any():
+            return shear
         return ContactShear(
             **{name: np.where(np.reshape(failed, (-1,) + (1,) * (v.ndim - 1)), np.nan, v) for name, v in vars(shear).items()}
         )

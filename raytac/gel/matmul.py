@@ -10,29 +10,20 @@ _ONE_THREAD = 250_000
 For work so small that costs more than it saves. Below it the result does not depend on the number of threads either."""
 
 
-def product(a: np.ndarray, b: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-    """a @ b, float32, in pieces small enough to stay on the calling thread."""
-    return stacked_product(a[None], b, None if out is None else out[None])[0]
-
-
-def stacked_product(a: np.ndarray, b: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-    """a @ b, float32 or float64, one of them a stack of B matrices, on the calling thread.
-
-    Each matrix of the stack is multiplied by itself, in small pieces, so that it does not matter which others there are.
-    """
-    rows, inner, columns = a.shape[-2], a.shape[-1], b.shape[-1]
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """a @ b, float32 or float64, in pieces small enough to stay on the calling thread."""
+    (rows, inner), columns = a.shape, b.shape[1]
     if rows * inner * columns <= _ONE_THREAD:
-        return np.matmul(a, b, out=out)
-    if out is None:
-        out = np.empty((len(a if a.ndim == 3 else b), rows, columns), a.dtype)
+        return a @ b
+    out = np.empty((rows, columns), a.dtype)
     if rows >= columns:
         step = max(_ONE_THREAD // (inner * columns), 1)
         for start in range(0, rows, step):
-            np.matmul(a[..., start : start + step, :], b, out=out[:, start : start + step])
+            np.matmul(a[start : start + step], b, out=out[start : start + step])
     else:
         step = max(_ONE_THREAD // (inner * rows), 1)
         for start in range(0, columns, step):
-            np.matmul(a, b[..., start : start + step], out=out[..., start : start + step])
+            np.matmul(a, b[:, start : start + step], out=out[:, start : start + step])
     return out
 
 

@@ -2,50 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+import warp as wp
 
-from raytac.errors import InputError
-from raytac.gel.components import span
-from raytac.gel.gaussian import GaussianBlur, fast_gaussian_matrix
-from raytac.gel.matmul import product
+from raytac.checks import check_known
+from raytac.gel import surround_kernels as kernels
+from raytac.gel.components import boxes
+from raytac.gel.gaussian import CONTACT_SCALE, FINAL_SIGMA, PYRAMID_SIGMAS, gaussian_matrix
 from raytac.gel.surface import GelSurface, PadGrid
+from raytac.warp_runtime import HostArrays, Recorded, start_warp
 
-_TAXIM_PIXEL = 0.0295e-3
-PYRAMID_SIGMAS = tuple(s * _TAXIM_PIXEL for s in (30.5, 15.5, 8.0, 3.5, 2.0, 1.1))
-"""Standard deviations of Taxim's pyramid [m].
-
-OpenCV's automatic σ for kernels 201, 101, 51, 21, 11, 5 at 0.0295 mm a pixel."""
-FINAL_SIGMA = 1.1 * _TAXIM_PIXEL
-"""Standard deviation of the last smoothing [m]."""
 CONTACT_RULES = ("unilateral", "threshold")
-CONTACT_SCALE = 0.4
-"""Share of the deepest overlap from which a node counts as in full contact."""
-FINEST = 0.2
+_FINEST = 0.2
 """Share of the pitch below which Gaussians are skipped: the grid cannot resolve them."""
-ROUNDING = 1e-5
+_ROUNDING = 1e-5
 """Excess of w over u in contact over the deepest overlap: above the rounding in float32."""
-_REACH = 4.8
-"""Standard deviations beyond which a contact has no effect: Φ(−4.8) is 10⁻⁶ of its depth."""
-
-_TOGETHER = 16384
-"""Most nodes of a grid whose environments are smoothed together, over the whole pad.
-
-On larger ones what lies around a contact costs more than a call for each environment."""
+_FACE = 1e-8
+"""Rounding of a height in float32, and some [m]."""
+_REACH = 5.3
+"""Standard deviations at which a Gaussian is 10⁻⁶ of its peak."""
+_CPU_LANES, _CUDA_LANES = 16, 4
+"""Nodes in a packet: a vector register of a processor, or what a thread of CUDA reads at once."""
 _STACK = 1 << 17
-"""Nodes of all environments that are processed at once, so that they stay in a core's cache."""
-
-Piece = tuple[slice, slice]
-"""Rows and columns, with plain starts and stops."""
-
-_LARGEST = 512
-"""Nodes along an axis up to which Gaussians are kept as matrices: 1 MB each in float32."""
+"""Nodes of all environments that a CPU processes at once, so that they stay in a core's cache."""
 
 
 class ElasticSurround:
-    """Deformed surface from the overlap of object and resting gel (Si & Yuan, RA-L 2022, III).
+    """Deformed surfaces from the overlap of objects and resting gel (Si & Yuan, RA-L 2022, III).
 
     With u = rest − underside of the object (its overlap with the gel at rest) and u⁺ = max(u, 0): start from w = u⁺; for every width
     of the pyramid, wide to narrow, w ← Gaussian(w), then the contact is re-imposed; last, one narrow Gaussian everywhere. The surface
@@ -57,273 +43,202 @@ class ElasticSurround:
       tears the surface along the border of C on steep walls (dots in the image) and lets the gel reach into the object outside C.
 
     Taxim does this to absolute heights in pixels; here it is done to the displacement w and with widths in metres, so that the dome is
-    not smoothed, an untouched pad is exactly at rest, and the result does not depend on the grid. Borders are mirrored. Arrays are
-    float32.
+    not smoothed, an untouched pad is exactly at rest, and the result does not depend on the grid. Borders are mirrored.
+
+    ``surface`` takes and gives NumPy arrays. ``launch`` works on Warp arrays of the CPU or of CUDA, so that it can be recorded. An
+    environment's result does not depend on the others, to the last bit.
+
+    Attributes:
+        overlap: u⁺ [m], (B, Ny, Nx), float32, which ``launch`` reads, and with it
+        window: columns from, to and rows from, to of the nodes where it is not 0, (B,), vec4i; zeros for none;
+        deepest: its greatest value [m], (B,), float32.
+        height: [m], (B, Ny, Nx), float32; at rest where nothing touches, and where ``lost``.
+        contact: 1 where an object touches, (B, Ny, Nx), uint8.
+        centre: overlap-weighted centre of the contact (x, y) [m], (B,), vectors of float64; NaN without contact.
+        lost: 1 in environments whose gel would lie below its bonded face, (B,), int32.
     """
 
     def __init__(
         self,
         grid: PadGrid,
         *,
+        thickness: float = np.inf,
+        num_envs: int = 1,
+        device: str = "cpu",
         sigmas: tuple[float, ...] = PYRAMID_SIGMAS,
         final_sigma: float = FINAL_SIGMA,
         contact_rule: str = "unilateral",
         contact_scale: float = CONTACT_SCALE,
     ) -> None:
-        """``sigmas`` [m], wide to narrow; ``final_sigma`` [m], 0: none; threshold's scale, [0, 1)."""
-        if contact_rule not in CONTACT_RULES:
-            raise InputError("contact_rule", value=contact_rule, rule="must be a known rule", choices=CONTACT_RULES)
-        self.grid, self.contact_rule, self.contact_scale = grid, contact_rule, contact_scale
-        finest = FINEST * min(grid.pitch)
-        self._pyramid = [GaussianBlur(grid.shape, grid.pitch, s) for s in sigmas if s > finest]
-        self._final = GaussianBlur(grid.shape, grid.pitch, final_sigma) if final_sigma > finest else None
-        kept = [blur.sigma for blur in (*self._pyramid, *([] if self._final is None else [self._final]))]
-        self._composed = ComposedGaussians(grid.shape, grid.pitch, kept)
-        self._reach = _REACH * float(np.sqrt(np.square([*sigmas, final_sigma]).sum()))
-        self._rest = grid.rest.astype(np.float32)
+        """Make the arrays.
+
+        Args:
+            grid: nodes of the pad.
+            thickness: of its gel [m], beyond which it cannot be pressed.
+            num_envs: environments B that are computed together; ``surface`` takes any number, so many at a time.
+            sigmas: [m], wide to narrow; ``final_sigma`` [m], 0 for none.
+            contact_rule: one of ``CONTACT_RULES``; ``contact_scale``: of the threshold, [0, 1).
+
+        Raises ``InputError`` for an unknown rule.
+        """
+        check_known("contact_rule", contact_rule, CONTACT_RULES)
+        start_warp()
+        self.grid, self.device = grid, wp.get_device(device)
+        self._lanes = _CPU_LANES if self.device.is_cpu else _CUDA_LANES
+        self._scale = contact_scale if contact_rule == "threshold" else -1.0
+        self._lowest, self._shallow = float(-thickness - _FACE), float(thickness + grid.rest.min())
+        finest = _FINEST * min(grid.pitch)
+        widths = [sigma for sigma in sigmas if sigma > finest] or [0.0]
+        self._pyramid = [_Gaussian(grid, sigma, self._lanes, self.device) for sigma in widths]
+        self._final = _Gaussian(grid, final_sigma, self._lanes, self.device) if final_sigma > finest else None
+        spread = np.cumsum(np.square([*widths, final_sigma]))
+        self._reaches = [np.ceil(_REACH * np.sqrt(one) / grid.pitch).astype(int) + 2 for one in spread]
+        """Nodes along x and y that each Gaussian, with those before, reaches."""
+        self._allocate(num_envs)
+
+    def _allocate(self, num_envs: int) -> None:
+        (ny, nx), lanes = self.grid.shape, self._lanes
+        count, (packet, mask) = -(-nx // lanes), kernels.packet_types(lanes)
+        lines = kernels.ROWS * -(-ny // kernels.ROWS)
+        rows = min(num_envs, max(_STACK // (ny * nx), 1)) if self.device.is_cpu else num_envs
+        padded = np.zeros((ny, count * lanes), np.float32)
+        padded[:, :nx] = self.grid.rest
+        self._rest = wp.array(padded.reshape(ny, count, lanes), dtype=packet, device=self.device)
+        self._x, self._y = (wp.array(line, dtype=wp.float64, device=self.device) for line in (self.grid.x, self.grid.y))
+        self._firsts = range(0, num_envs, rows)
+        self._overlaps = self._zeros((num_envs, lines, count), packet)
+        self._field, self._spare = (self._zeros((rows, lines, count), packet) for _ in range(2))
+        self._moments = self._zeros((rows, ny), wp.vec2d)
+        self.window, self.deepest = self._zeros((num_envs,), wp.vec4i), self._zeros((num_envs,), wp.float32)
+        self._heights = self._zeros((num_envs, ny, count), packet)
+        self._contacts = self._zeros((num_envs, ny, count), mask)
+        self.overlap, self.height, self.contact = (
+            _nodes(packets, ny, nx) for packets in (self._overlaps, self._heights, self._contacts)
+        )
+        self._spare_nodes = _nodes(self._spare)
+        self.centre, self.lost = self._zeros((num_envs,), wp.vec2d), self._zeros((num_envs,), wp.int32)
 
     def surface(self, object_height: np.ndarray, pad_from_object: np.ndarray | None = None) -> GelSurface:
         """Deformed surface under an object.
 
         ``object_height`` [m]: underside in the pad frame, shape (B, Ny, Nx), ``inf`` where nothing is above (see
-        ``raytac.shapes.underside``); ``pad_from_object`` (B, 4, 4) is passed on. An environment with NaN in it gets a surface of
-        NaN without contact.
+        ``raytac.shapes.underside``); ``pad_from_object`` (B, 4, 4) is passed on. An environment with NaN in it, or whose gel would lie
+        below its bonded face, gets a surface of NaN without contact.
         """
-        batch = len(object_height)
-        height = np.empty((batch, *self.grid.shape), np.float32)
-        contact = np.zeros(height.shape, bool)
-        centre = np.full((batch, 2), np.nan)
-        if self.grid.rest.size <= _TOGETHER:
-            count = max(_STACK // self.grid.rest.size, 1)
-            for start in range(0, batch, count):
-                some = slice(start, start + count)
-                self._press_together(object_height[some], height[some], contact[some], centre[some])
-        else:
-            for b in range(batch):
-                centre[b] = self._press(object_height[b], height[b], contact[b])
+        count, starts = len(self.lost), range(0, max(len(object_height), 1), len(self.lost))
+        parts = [self._surface(object_height[start : start + count]) for start in starts]
+        height, contact, centre = (
+            values[0] if len(parts) == 1 else np.concatenate(values) for values in zip(*parts, strict=True)
+        )
         return GelSurface(self.grid, height, contact, centre, pad_from_object)
 
-    def _press_together(self, under: np.ndarray, height: np.ndarray, contact: np.ndarray, centre: np.ndarray) -> None:
-        """Write height, contact and its centre under objects, whose undersides are ``under``.
-
-        Environments are smoothed in one call; an environment's result does not depend on its neighbours.
-        """
-        overlap, field, pressed, spare = (own[: len(under)] for own in self._memory)
-        np.subtract(self.grid.rest, under, out=overlap, casting="same_kind")
-        deepest = overlap.max(axis=(1, 2))
-        height[:] = self._rest
-        height[np.isnan(deepest)] = np.nan
-        rows = np.flatnonzero(deepest > 0.0)
-        if not len(rows):
-            return
-        if len(rows) < len(overlap):
-            np.take(overlap, rows, axis=0, out=field[: len(rows)])
-            overlap, field, pressed, spare = (own[: len(rows)] for own in (field, overlap, pressed, spare))
-        deepest = deepest[rows, None, None]
-        np.maximum(overlap, np.float32(0.0), out=pressed)
-        field[:] = pressed
-        full = None if self.contact_rule == "unilateral" else overlap > np.float32(self.contact_scale) * deepest
-        for blur in self._pyramid:
-            blur.of_stack(field, spare)
-            if full is None:
-                np.maximum(field, pressed, out=field)
-            else:
-                np.copyto(field, pressed, where=full)
-        if full is None:
-            np.add(pressed, _slack(deepest), out=spare)
-            full = (overlap > 0.0) & (field <= spare)
-        contact[rows] = full
-        np.multiply(pressed, full, out=spare)
-        centre[rows] = self._centroids(spare)
-        if self._final is not None:
-            self._final.of_stack(field, spare)
-        height[rows] = np.subtract(self._rest, field, out=spare)
+    def _surface(self, under: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Height, contact and its centre of at most ``num_envs`` environments."""
+        inputs, launch = self._host
+        (overlap, window, deepest), count = inputs.values, len(under)
+        u = overlap[:count]
+        np.subtract(self.grid.rest, under, out=u, casting="same_kind")
+        deepest[:count] = u.max(axis=(1, 2))
+        failed = np.isnan(deepest[:count])
+        np.maximum(u, np.float32(0.0), out=u)
+        window[count:], window[:count] = 0, boxes(u > 0.0)
+        window[:count][failed] = 0
+        inputs.write()
+        launch()
+        height, contact, centre, lost = self.results(count)
+        height[lost | failed] = np.nan
+        return height, contact, centre
 
     @cached_property
-    def _memory(self) -> tuple[np.ndarray, ...]:
-        """Arrays for ``_press_together``, since new ones would take longer to get than to fill."""
-        shape = max(_STACK // self.grid.rest.size, 1), *self.grid.shape
-        return tuple(np.empty(shape, np.float32) for _ in range(4))
+    def _host(self) -> tuple[HostArrays, Recorded]:
+        """Arrays that ``launch`` reads, and ``launch`` recorded."""
+        return HostArrays(self.overlap, self.window, self.deepest), Recorded(self.launch, device=self.device)
 
     @cached_property
-    def _weights(self) -> np.ndarray:
-        """As ``overlap`` of ``_centroids``, in float64."""
-        return np.empty(self._memory[0].shape)
+    def _results(self) -> HostArrays:
+        return HostArrays(self.height, self.contact, self.centre, self.lost)
 
-    def _centroids(self, overlap: np.ndarray) -> np.ndarray:
-        """Overlap-weighted centres (x, y) [m], (n, 2), of contacts (n, Ny, Nx), 0 outside."""
-        weights = self._weights[: len(overlap)]
-        weights[:] = overlap
-        lines = np.stack([np.ones_like(self.grid.y), self.grid.y])
-        sums = lines @ weights  # of every column: the overlap and its moment along y
-        moments = np.stack([(sums[:, 0] * self.grid.x).sum(axis=1), sums[:, 1].sum(axis=1)], axis=1)
-        return moments / sums[:, 0].sum(axis=1)[:, None]
+    def results(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Copies of height, contact, centre and ``lost`` of the first environments."""
+        height, contact, centre, lost = (values[:count].copy() for values in self._results.read())
+        return height, contact.view(bool), centre, lost != 0
 
-    def _press(self, under: np.ndarray, height: np.ndarray, contact: np.ndarray) -> tuple[float, float]:
-        """``_press_together`` of one environment; returns the contact's centre."""
-        overlap = np.subtract(self.grid.rest, under).astype(np.float32)
-        deepest = overlap.max()
-        height[:] = np.nan if np.isnan(deepest) else self._rest
-        if not deepest > 0.0:
-            return np.nan, np.nan
-        touched = _touched(overlap)
-        window = around(touched, self._reach, self.grid.pitch, (slice(0, overlap.shape[0]), slice(0, overlap.shape[1])))
-        overlap = overlap[touched]
-        displacement, contact[touched] = self._displacement(overlap, deepest, touched, window)
-        height[window] -= displacement
-        return self._centroid(overlap, contact[touched], touched)
+    def clear(self) -> None:
+        """Launch that nothing overlaps the gel."""
+        self._overlaps.zero_()
 
-    def _displacement(self, overlap: np.ndarray, deepest: float, touched: Piece, window: Piece) -> tuple[np.ndarray, np.ndarray]:
-        """w [m] on the window, and the contact on ``touched``, for the ``overlap`` there."""
-        pressed = np.maximum(overlap, 0.0)
-        full = overlap > self.contact_scale * deepest
-        field, w = self._field(pressed, touched, window), pressed
-        for _ in self._pyramid:
-            w = field.smooth()
-            w = np.maximum(w, pressed) if self.contact_rule == "unilateral" else np.where(full, pressed, w)
-            field.impose(w)
-        contact = (overlap > 0.0) & (w <= pressed + _slack(np.float32(deepest))) if self.contact_rule == "unilateral" else full
-        return field.over(window), contact
+    def launch(self) -> None:
+        """Launch the kernels for ``overlap``, ``window`` and ``deepest``; nothing waits for the device."""
+        ny = self.grid.shape[0]
+        for first in self._firsts:
+            envs = min(len(self._field), len(self.lost) - first)
+            lines, overlap, before = (envs, ny), (self._overlaps, self.deepest, self._scale), np.zeros(2, int)
+            for k, blur in enumerate(self._pyramid):
+                before = self._smooth(first, envs, before, blur, k, imposes=self._scale < 0.0)
+                if self._scale >= 0.0:
+                    self._launch(kernels.impose, lines, [first, self.window, *overlap, self._field])
+            touched = [self._overlaps, self._field, self.deepest, self._scale, _ROUNDING, self._x, self._contacts, self._moments]
+            self._launch(kernels.touch, lines, [first, self.window, *touched])
+            self._launch(kernels.find_centre, envs, [first, self.window, self._moments, self._y, self.centre, self.lost])
+            if self._final:
+                before = self._smooth(first, envs, before, self._final, len(self._pyramid), imposes=False)
+            lifted = [self._rest, self._field, self.deepest, self._shallow, self._lowest, self._heights, self.lost]
+            self._launch(kernels.lift_off, lines, [first, self.window, wp.vec2i(*before), *lifted])
+            shown = [self._rest, self._heights, self._contacts, self.centre]
+            self._launch(kernels.without_lost, lines, [first, self.lost, *shown])
 
-    def _field(self, pressed: np.ndarray, touched: Piece, window: Piece) -> WholeField | LocalField:
-        """The cheaper method: local, if the contact is narrower than the reach of the Gaussians."""
-        widths = (pitch * (line.stop - line.start) for line, pitch in zip(touched, reversed(self.grid.pitch), strict=True))
-        if self._composed.fits and max(widths) <= self._reach:
-            return LocalField(pressed, touched, self._composed, len(self._pyramid), self._final is not None, _REACH)
-        return WholeField(pressed, touched, window, self._pyramid, self._final)
+    def _smooth(self, first: int, envs: int, before: np.ndarray, blur: _Gaussian, k: int, *, imposes: bool) -> np.ndarray:
+        """Launch the ``k``-th Gaussian of a field that reaches ``before`` (x, y) nodes around the overlap; returns how far it reaches."""
+        _, lines, count = self._field.shape
+        after = np.minimum(before + blur.reach, self._reaches[k])
+        threads = 1 if self.device.is_cpu else count
+        dim, reach = (envs, lines // kernels.ROWS, threads), [first, self.window, wp.vec2i(*before), wp.vec2i(*after)]
+        source = [0, self._field] if k else [first, self._overlaps]
+        self._launch(kernels.along_columns, dim, [*reach, blur.down, blur.down_band, threads, *source, self._spare])
+        imposed = [self._overlaps, int(imposes), self._field]
+        self._launch(kernels.along_rows, dim, [*reach, blur.across, blur.across_band, threads, self._spare_nodes, *imposed])
+        return after
 
-    def _centroid(self, overlap: np.ndarray, contact: np.ndarray, window: Piece) -> tuple[float, float]:
-        """Overlap-weighted centre (x, y) [m] of the contact, both of the shape of the window."""
-        weight = np.where(contact, overlap, 0.0).astype(float)
-        total = weight.sum()
-        x, y = self.grid.x[window[1]], self.grid.y[window[0]]
-        return float(weight.sum(axis=0) @ x / total), float(weight.sum(axis=1) @ y / total)
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
+
+    def _zeros(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device=self.device)
 
 
-def _slack(deepest: np.ndarray | np.float32) -> np.ndarray:
-    """Excess of w over u that still is contact [m].
+class _Gaussian:
+    """One Gaussian as products with matrices along both axes, on the device."""
 
-    Where the overlap is constant the Gaussians keep it up to rounding, which must not decide the contact. The deepest node is always in
-    contact, since no Gaussian exceeds the maximum.
-    """
-    return np.maximum(np.float32(ROUNDING) * deepest, np.finfo(np.float32).tiny)
-
-
-def _touched(overlap: np.ndarray) -> Piece:
-    """Rows and columns in which the object overlaps the resting gel."""
-    mask = overlap > 0.0
-    rows = span(mask.any(axis=1))
-    return rows, span(mask[rows].any(axis=0))
-
-
-class WholeField:
-    """Field on a window, 0 at first outside ``touched``, which every Gaussian sets again."""
-
-    def __init__(
-        self, values: np.ndarray, touched: Piece, window: Piece, blurs: Sequence[GaussianBlur], final: GaussianBlur | None
-    ) -> None:
-        """``values``: on ``touched``, float32; ``window``: beyond it the field stays 0."""
-        self._blurs, self._final, self._window, self._next = blurs, final, window, 0
-        self._field = np.zeros([line.stop - line.start for line in window], np.float32)
-        self._touched = _within(touched, window)
-        self._field[self._touched] = values
-
-    def smooth(self) -> np.ndarray:
-        """Apply the next Gaussian; returns the field on ``touched``."""
-        self._field = self._blurs[self._next](self._field, self._window)
-        self._next += 1
-        return self._field[self._touched]
-
-    def impose(self, values: np.ndarray) -> None:
-        """Set the field on ``touched``."""
-        self._field[self._touched] = values
-
-    def over(self, window: Piece) -> np.ndarray:
-        """The field on the initial window, with the last Gaussian if there is one."""
-        return self._field if self._final is None else self._final(self._field, window)
+    def __init__(self, grid: PadGrid, sigma: float, lanes: int, device: Any) -> None:
+        """``sigma`` [m]; ``lanes``: nodes in a packet."""
+        (ny, nx), (dx, dy) = grid.shape, grid.pitch
+        (along_y, reach_y), (along_x, reach_x) = gaussian_matrix(ny, sigma / dy), gaussian_matrix(nx, sigma / dx)
+        self.reach = np.array([reach_x, reach_y])
+        """Nodes along x and y."""
+        down, self.down_band = _blocks(along_y, kernels.ROWS, device)
+        self.down = wp.array(np.ascontiguousarray(down.transpose(1, 0, 2)), dtype=wp.vec4f, device=device)
+        """Weights of ``ROWS`` rows in a vector, (blocks, Ny)."""
+        across, self.across_band = _blocks(along_x, lanes, device)
+        self.across = wp.array(across, dtype=kernels.packet_types(lanes)[0], device=device)
+        """Weights of a packet of columns in a vector, (Nx, packets)."""
 
 
-class ComposedGaussians:
-    """Products of successive Gaussians as matrices on one grid, made at the first small contact.
-
-    Successive discrete Gaussians are one of the sum of their variances, also with mirrored borders (see ``gaussian_matrix``).
-    """
-
-    def __init__(self, shape: tuple[int, int], pitch: tuple[float, float], sigmas: Sequence[float]) -> None:
-        """``shape`` (Ny, Nx); ``pitch`` (x, y) [m]; ``sigmas`` [m] in their order."""
-        self.shape, self.pitch, self._squares = shape, pitch, np.square(sigmas)
-        self._matrices: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
-
-    @property
-    def fits(self) -> bool:
-        """True if the matrices are small enough to be cached."""
-        return max(self.shape) <= _LARGEST
-
-    def sigma(self, first: int, last: int) -> float:
-        """Standard deviation of the Gaussians from ``first`` to ``last`` [m]."""
-        return float(np.sqrt(self._squares[first : last + 1].sum()))
-
-    def apply(self, first: int, last: int, values: np.ndarray, touched: Piece, piece: Piece) -> np.ndarray:
-        """Field on ``piece`` after the Gaussians ``first`` to ``last`` of ``values`` on ``touched``."""
-        if (first, last) not in self._matrices:
-            sigma = self.sigma(first, last)
-            self._matrices[first, last] = tuple(  # type: ignore[assignment]
-                fast_gaussian_matrix(nodes, sigma / pitch) for nodes, pitch in zip(self.shape, reversed(self.pitch), strict=True)
-            )
-        along_y, along_x = self._matrices[first, last]
-        return product(product(along_y[piece[0], touched[0]], values), along_x[piece[1], touched[1]].T)
+def _blocks(matrix: np.ndarray, size: int, device: Any) -> tuple[np.ndarray, wp.array]:
+    """Rows of a matrix (n, n) in blocks, (n, blocks, size), float32, and the columns of each, from and to, that are not 0."""
+    count = -(-len(matrix) // size)
+    padded = np.zeros((count * size, len(matrix)), np.float32)
+    padded[: len(matrix)] = matrix
+    used = (padded != 0.0).reshape(count, size, -1).any(axis=1)
+    band = np.stack([used.argmax(axis=1), len(matrix) - used[:, ::-1].argmax(axis=1)], axis=1)
+    return np.ascontiguousarray(padded.T).reshape(-1, count, size), wp.array(band, dtype=wp.vec2i, device=device)
 
 
-class LocalField:
-    """``WholeField`` as a sum of increments on ``touched``, smoothed by all later Gaussians.
-
-    Only the re-imposed contact is not linear, and it acts on ``touched`` alone. So the field is computed there, and at the end over the
-    window. With m nodes along a side of ``touched`` and n Gaussians this takes about n² m³ multiply-adds, whatever the window.
-    """
-
-    def __init__(
-        self, values: np.ndarray, touched: Piece, gaussians: ComposedGaussians, count: int, final: bool, reach: float
-    ) -> None:
-        """``count`` Gaussians before an imposition, one more if ``final``, each to ``reach`` σ."""
-        self._gaussians, self._touched = gaussians, touched
-        self._last, self._reach = count - 1 + final, reach
-        self._increments, self._present = [values], values
-
-    def smooth(self) -> np.ndarray:
-        last = len(self._increments) - 1
-        total = np.zeros_like(self._present)
-        for first, values in enumerate(self._increments):
-            total += self._gaussians.apply(first, last, values, self._touched, self._touched)
-        self._present = total
-        return total
-
-    def impose(self, values: np.ndarray) -> None:
-        self._increments.append(values - self._present)
-        self._present = values
-
-    def over(self, window: Piece) -> np.ndarray:
-        total = np.zeros([line.stop - line.start for line in window], np.float32)
-        for first, values in enumerate(self._increments):
-            if first > self._last:  # no Gaussian comes after it
-                total[_within(self._touched, window)] += values
-                continue
-            # A discrete Gaussian narrower than a node reaches farther for its width than a wide one.
-            margin = self._reach * self._gaussians.sigma(first, self._last) + 2.0 * max(self._gaussians.pitch)
-            piece = around(self._touched, margin, self._gaussians.pitch, window)
-            total[_within(piece, window)] += self._gaussians.apply(first, self._last, values, self._touched, piece)
-        return total
-
-
-def around(piece: Piece, margin: float, pitch: tuple[float, float], within: Piece) -> Piece:
-    """A piece with a ``margin`` [m] around it, clipped to the piece ``within``."""
-    rows, columns = (
-        slice(max(line.start - nodes, whole.start), min(line.stop + nodes, whole.stop))
-        for line, nodes, whole in zip(piece, (int(np.ceil(margin / p)) for p in reversed(pitch)), within, strict=True)
+def _nodes(packets: wp.array, rows: int | None = None, columns: int | None = None) -> wp.array:
+    """The first rows and columns of an array of packets (B, n, m), node by node, in the same memory; None is all."""
+    *shape, count = packets.shape
+    kind: Any = packets.dtype
+    nodes: Any = wp.array(
+        ptr=packets.ptr, shape=(*shape, count * kind._length_), dtype=kind._wp_scalar_type_, device=packets.device
     )
-    return rows, columns
-
-
-def _within(piece: Piece, window: Piece) -> Piece:
-    """A piece of the grid in the window's own rows and columns."""
-    rows, columns = (slice(line.start - whole.start, line.stop - whole.start) for line, whole in zip(piece, window, strict=True))
-    return rows, columns
+    nodes._packets = packets  # whose memory it is
+    return nodes[:, :rows, :columns]

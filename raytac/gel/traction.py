@@ -57,7 +57,7 @@ class CoatTraction:
         return out
 
 
-def foundation_traction(surface: GelSurface, force: np.ndarray, twist: np.ndarray) -> np.ndarray:
+def foundation_traction(surface: GelSurface, force: np.ndarray, twist: np.ndarray, *, about_origin: bool = False) -> np.ndarray:
     """Traction [Pa], (B, Ny, Nx, 3), of a total force, distributed as by an elastic foundation.
 
     The normal traction is proportional to the indentation in contact (K. L. Johnson, Contact Mechanics, section 4.3). The tangential
@@ -68,9 +68,11 @@ def foundation_traction(surface: GelSurface, force: np.ndarray, twist: np.ndarra
         surface: gives contact and indentation.
         force: of the object on the gel, pad frame [N], shape (B, 3).
         twist: torque about +z through the contact's centre [N m], shape (B,).
+        about_origin: the torque is about the pad frame's origin.
     """
     grid = surface.grid
-    return spread_force((grid.x, grid.y, cell_areas(grid)), surface.contact, surface.indentation, force, twist)
+    nodes = grid.x, grid.y, cell_areas(grid)
+    return spread_force(nodes, surface.contact, surface.indentation, force, twist, about_origin=about_origin)
 
 
 def spread_force(
@@ -81,8 +83,7 @@ def spread_force(
     Args:
         nodes: x of the columns (Nx,) and y of the rows (Ny,) [m], and areas (Ny, Nx) [m²].
         contact, indentation: of the surfaces, (B, Ny, Nx), bool and [m].
-        force, twist: as there.
-        about_origin: the torque is about the pad frame's origin.
+        force, twist, about_origin: as there.
     """
     x, y, area = nodes
     xp, count = array_namespace(indentation), indentation.shape[0]

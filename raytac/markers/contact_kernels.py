@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from raytac.markers.contacts import TWIST_SLIP
-from raytac.physics.rigid.motion_kernels import turn_of
+from raytac.physics.rigid.motion_kernels import is_finite, turn_of
 from raytac.physics.rigid.world_kernels import Shear
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -256,15 +256,6 @@ def root_below(parent: wp.array2d(dtype=wp.int32), env: wp.int32, cell: wp.int32
     return at
 
 
-@wp.func
-def is_known(pose: wp.mat44d) -> wp.bool:
-    total = wp.float64(0.0)
-    for k in range(3):
-        for m in range(4):
-            total += pose[k, m]
-    return wp.isfinite(total)
-
-
 @wp.kernel
 def choose_object(
     poses: wp.array3d(dtype=wp.mat44d),
@@ -327,7 +318,7 @@ def follow(
     env, room, pose = envs[row] + 0, contacts.shape[1], poses[row]
     old = pose_before[env]
     d, x, y, angle = wp.identity(n=3, dtype=wp.float64), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
-    if is_known(pose) and is_known(old):
+    if is_finite(pose) and is_finite(old):
         d = turn_of(pose) * wp.transpose(turn_of(old))
         x = pose[0, 3] - d[0, 0] * old[0, 3] - d[0, 1] * old[1, 3] - d[0, 2] * old[2, 3]
         y = pose[1, 3] - d[1, 0] * old[0, 3] - d[1, 1] * old[1, 3] - d[1, 2] * old[2, 3]

@@ -10,6 +10,7 @@ import numpy as np
 
 from raytac.checks import is_number
 from raytac.errors import InputError
+from raytac.gel.components import boxes
 from raytac.gel.surface import GelSurface, PadGrid
 
 TWIST_SLIP = 3 * math.pi / 16
@@ -135,7 +136,7 @@ class ContactSamples:
     def boxes(self) -> np.ndarray:
         """Columns [c0, c1) and rows [r0, r1) of each contact, (B, 4), uint32; 0 without contact."""
         if len(self.contact) > 1:
-            return contact_boxes(self.contact)
+            return boxes(self.contact)
         r0, r1, c0, c1 = self.box
         return np.array([[c0, c1, r0, r1]], dtype=np.uint32)
 
@@ -150,13 +151,6 @@ def _box_of(mask: np.ndarray) -> tuple[int, int, int, int]:
     r0, r1 = first // width, flat.rfind(1) // width + 1
     line = mask[r0:r1].any(axis=0).tobytes()
     return r0, r1, line.find(1), line.rfind(1) + 1
-
-
-def contact_boxes(contact: np.ndarray) -> np.ndarray:
-    """As ``ContactSamples.boxes``, of masks (B, ny, nx)."""
-    lines = np.any(contact, axis=1), np.any(contact, axis=2)
-    edges = [edge for line in lines for edge in (line.argmax(axis=1), line.shape[1] - line[:, ::-1].argmax(axis=1))]
-    return np.where(np.any(lines[1], axis=1)[:, None], np.stack(edges, axis=1), 0).astype(np.uint32)
 
 
 @dataclass(frozen=True)

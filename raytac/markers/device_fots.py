@@ -73,7 +73,7 @@ class DeviceFots:
         """Launch the kernels, once for every surface of the motion; nothing waits for the device.
 
         Args:
-            height, contact: as of ``DeviceSurround``.
+            height, contact: as of ``ElasticSurround``.
             poses: ``pad_from_body`` (B, pads, bodies + …); ``pad``: index of this one.
             depths: overlap of each body with the pad (B, bodies) [m]; the deepest is the object.
             sound: environments that have not broken down, (B,), bool; of the others it is kept which body was the object.

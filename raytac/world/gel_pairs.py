@@ -11,13 +11,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from raytac.gel.surface import PadGrid, make_grid
+from raytac.gel.surface import make_grid
 from raytac.physics.rigid.search import PadSearch
-from raytac.se3 import inverse
 from raytac.shapes.part import Part, mesh_part
-from raytac.shapes.underside import object_height
 from raytac.specs.sensor import GelpadSpec
 
+_WIDER = 1e-5
+"""Share by which a gel that is shown is wider, so that rounding does not leave out nodes on the edge of one of the same size."""
 _PITCH = 0.8e-3
 """Spacing of the vertices of a gel's surface [m]; a dome of 100 mm is off by 1 µm."""
 
@@ -27,9 +27,8 @@ class GelPairs:
 
     def __init__(self, gels: Sequence[GelpadSpec], bodies: np.ndarray, num_envs: int, *, device: str = "cpu") -> None:
         """``bodies`` (pads,): indices of the bodies that carry the pads."""
-        self._gels = tuple(gels)
         parts = [(_gel_part(gel),) for gel in gels] if len(gels) > 1 else []
-        self._parts = parts
+        self._shown = [(_gel_part(gel, 1.0 + _WIDER),) for gel in gels] if len(gels) > 1 else []
         self.pairs: list[tuple[int, int, PadSearch]] = [
             (i, j, PadSearch([gels[i]], [parts[j]], num_envs=num_envs, device=device))
             for i in range(len(gels))
@@ -39,30 +38,18 @@ class GelPairs:
         """Two pads, and the search for the second one's gel as a body that the first touches."""
         self._modulus = np.array([gel.youngs_modulus for gel in gels])
 
-    def press(self, pad: int, height: np.ndarray, grid: PadGrid, world_from_pad: np.ndarray, failed: np.ndarray) -> None:
-        """Lower ``height`` (n, Ny, Nx) of ``pad`` by its share of the overlap with other gels."""
-        for i, j, _ in self.pairs:
-            if pad not in (i, j):
-                continue
-            other = j if pad == i else i
-            poses = inverse(world_from_pad[:, pad]) @ world_from_pad[:, other]
-            near = np.flatnonzero(~failed & (np.linalg.norm(poses[:, :3, 3], axis=1) < self._reach(pad) + self._reach(other)))
-            if not len(near):
-                continue
-            under = object_height(self._parts[other], poses[near], grid.x, grid.y, below=float(grid.rest.max()))
-            share = self._modulus[other] / (self._modulus[pad] + self._modulus[other])
-            pressed = np.where(under < grid.rest, grid.rest - share * (grid.rest - under), np.inf)
-            height[near] = np.minimum(height[near], pressed)
-
-    def _reach(self, pad: int) -> float:
-        return 0.5 * float(np.hypot(*self._gels[pad].size)) + self._gels[pad].thickness
+    def gels(self, pad: int) -> list[tuple[tuple[Part, ...], float]]:
+        """Gels of all pads as ``PressedGel`` takes them, 0 for those that ``pad`` does not touch; empty if it touches none."""
+        others = {i + j - pad for i, j, _ in self.pairs if pad in (i, j)}
+        shares = [k in others and self._modulus[k] / (self._modulus[pad] + self._modulus[k]) for k in range(len(self._modulus))]
+        return [(parts, float(share)) for parts, share in zip(self._shown, shares, strict=True)] if others else []
 
 
-def _gel_part(gelpad: GelpadSpec) -> Part:
-    """The gel at rest as a closed mesh, pad frame."""
+def _gel_part(gelpad: GelpadSpec, scale: float = 1.0) -> Part:
+    """The gel at rest as a closed mesh, pad frame; ``scale``: of its width."""
     grid = make_grid(gelpad, _PITCH)
     ny, nx = grid.shape
-    x, y = (values.ravel() for values in np.meshgrid(grid.x, grid.y))
+    x, y = (scale * values.ravel() for values in np.meshgrid(grid.x, grid.y))
     top, back = np.stack([x, y, grid.rest.ravel()], axis=1), np.stack([x, y, np.full(x.size, -gelpad.thickness)], axis=1)
     node = np.arange(ny * nx).reshape(ny, nx)
     a, b, c, d = (node[rows, columns].ravel() for rows in (slice(-1), slice(1, None)) for columns in (slice(-1), slice(1, None)))

@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import warp as wp
 
-from raytac.gel.device_surround import DeviceSurround
 from raytac.gel.surface import PadGrid
 from raytac.markers.base import MarkersConfig
 from raytac.markers.device_fots import DeviceFots
 from raytac.physics.rigid.gel_contact import GelContact
-from raytac.physics.rigid.underside import Undersides
+from raytac.physics.rigid.pressed_gel import PressedGel
 from raytac.shapes.part import Part
 from raytac.specs.sensor import SensorSpec
-from raytac.world.start_kernels import copy_mask, lose_marked
+from raytac.world.start_kernels import lose_marked
 
 
 class PadTouch:
     """Heights and markers of ``PadSurfaces`` and ``MarkerTracker``, on the CPU or on CUDA.
 
-    Another gel that presses is not shown.
-
     Attributes:
-        height, contact: as of ``DeviceSurround``.
+        gel: of the pad.
+        height, contact: as of ``ElasticSurround``.
         fots: markers; None without.
     """
 
@@ -34,6 +33,7 @@ class PadTouch:
         bodies: Sequence[Sequence[Part]],
         markers: MarkersConfig | None,
         *,
+        gels: Sequence[tuple[Sequence[Part], float]] = (),
         pad: int,
         num_envs: int,
         patches: int = 8,
@@ -44,33 +44,32 @@ class PadTouch:
         Args:
             spec: of the sensor; ``grid``: nodes of its pad.
             bodies: parts of every body, body frame.
+            gels: other gels that press this one, as of ``PressedGel``.
             pad: index among the pads of the world.
             patches: most separate contacts of the pad, for its markers.
 
         Raises ``InputError`` as ``DeviceFots``.
         """
-        thickness = spec.gelpad.thickness
-        self._pad, self._bodies = pad, len(bodies)
-        self._undersides = Undersides(grid, thickness, bodies, num_envs=num_envs, device=device)
-        self._surround = DeviceSurround(grid, thickness, num_envs=num_envs, device=device)
+        self._pad, self._bodies, self._poses = pad, len(bodies), len(bodies) + len(gels)
+        self.gel = PressedGel(grid, spec.gelpad.thickness, bodies, gels=gels, num_envs=num_envs, device=device)
         self.fots = (
             None if markers is None else DeviceFots(spec, markers, grid, num_envs=num_envs, patches=patches, device=device)
         )
-        self.height, self.contact = self._surround.height, self._surround.contact
+        self.height, self.contact = self.gel.surround.height, self.gel.surround.contact
 
     def launch(self, contact: GelContact, active: wp.array) -> None:
         """Launch the kernels for the poses of ``contact.motion``.
 
         ``active`` (B,), bool: environments that have not broken down; one whose gel would lie below its bonded face is no longer.
         """
-        under, poses = self._undersides, contact.motion.pose
-        wp.copy(under.poses, poses[:, self._pad, : self._bodies])
-        wp.launch(copy_mask, dim=len(active), inputs=[active, under.sound], device=under.device)
-        under.launch()
-        self._surround.launch(under.height, under.deepest, active)
-        wp.launch(lose_marked, dim=len(active), inputs=[self._surround.pierced, active], device=under.device)
+        gel, poses = self.gel, contact.motion.pose
+        wp.copy(gel.poses, poses[:, self._pad, : self._poses])
+        wp.copy(gel.sound, active)
+        gel.launch()
+        wp.launch(lose_marked, dim=len(active), inputs=[gel.surround.lost, active], device=gel.device)
         if self.fots is not None:
-            self.fots.launch(self.height, self.contact, poses, self._pad, under.deepest, active, contact.shear.struct)
+            depth: Any = gel.depth[:, : self._bodies]
+            self.fots.launch(self.height, self.contact, poses, self._pad, depth, active, contact.shear.struct)
 
     def reset(self, mask: wp.array) -> None:
         """Forget the past of the pads of a mask (B,), bool, on the device."""

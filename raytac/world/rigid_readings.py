@@ -25,11 +25,12 @@ class RigidReadings:
 
     def __init__(self, composed: WorldModel, contact: GelContact, pairs: GelPairs, engine: Engine) -> None:
         """Readings of the pads of ``composed``; the others are as of ``RigidPads``."""
-        self.composed, self.contact, self.engine, self._pairs = composed, contact, engine, pairs
+        self.composed, self.contact, self.engine = composed, contact, engine
         self.bodies = composed.touched
         self._names = [mounted.name for mounted in composed.sensors]
         gels, shapes = [spec.gelpad for spec in composed.sensor_specs], [body.parts for body in self.bodies]
-        self.surfaces = PadSurfaces(dict(zip(self._names, gels, strict=True)), shapes, len(contact.wrenches))
+        self._others = {name: pairs.gels(k) for k, name in enumerate(self._names)}
+        self.surfaces = PadSurfaces(dict(zip(self._names, gels, strict=True)), shapes, len(contact.wrenches), self._others)
         self.report: dict[str, np.ndarray] = {}
 
     def check_beyond(self, envs: Sequence[int], pad_from_body: np.ndarray) -> None:
@@ -62,14 +63,14 @@ class RigidReadings:
         rows, index = np.arange(len(failed)) if envs is None else np.asarray(envs), self._names.index(name)
         pads, bodies = self.engine.read_poses()
         world_from_pad, failed = pads[rows], failed[rows]
+        others = np.concatenate([bodies[rows], world_from_pad], axis=1) if self._others[name] else bodies[rows]
         return self.surfaces.reading(
             name,
             grid,
-            inverse(world_from_pad[:, index])[:, None] @ bodies[rows],
+            inverse(world_from_pad[:, index])[:, None] @ others,
             self.wrench(name)[rows],
             failed,
             rows,
-            press=lambda height: self._pairs.press(index, height, grid, world_from_pad, failed),
             shear=lambda pressed: self.contact.shear.of(rows, index, pressed),
         )
 

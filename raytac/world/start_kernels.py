@@ -62,13 +62,6 @@ def set_columns(
 
 
 @wp.kernel
-def copy_mask(mask: wp.array(dtype=wp.bool), numbers: wp.array(dtype=wp.int32)):
-    """Copy a mask (B,) to numbers that are 0 or 1."""
-    i = wp.tid()
-    numbers[i] = wp.where(mask[i], 1, 0)
-
-
-@wp.kernel
 def lose_marked(marked: wp.array(dtype=wp.int32), active: wp.array(dtype=wp.bool)):
     """Environments that are marked (B,) are no longer active."""
     i = wp.tid()

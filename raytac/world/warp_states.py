@@ -71,8 +71,11 @@ class WarpStates:
         self._indices, self._scratch = PadIndices.of(composed), mujoco.MjData(model)
         place, bodies = self.world.engine.device, [body.parts for body in composed.touched]
         self._names = [mounted.name for mounted in composed.sensors]
+        gels = self.world.pairs.gels
         self._touches = {
-            one.name: PadTouch(one.spec, grids[one.name], bodies, markers, pad=k, num_envs=num_envs, device=str(place))
+            one.name: PadTouch(
+                one.spec, grids[one.name], bodies, markers, gels=gels(k), pad=k, num_envs=num_envs, device=str(place)
+            )
             for k, one in enumerate(composed.sensors)
             if one.name in grids
         }

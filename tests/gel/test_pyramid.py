@@ -10,9 +10,9 @@ import pytest
 
 from raytac.errors import InputError
 from raytac.gel import pyramid
-from raytac.gel.gaussian import GaussianBlur, gaussian_matrix
-from raytac.gel.pyramid import CONTACT_SCALE, ComposedGaussians, ElasticSurround, LocalField, WholeField
-from raytac.gel.surface import GelSurface, make_grid, rest_height
+from raytac.gel.gaussian import CONTACT_SCALE, FINAL_SIGMA, PYRAMID_SIGMAS, gaussian_matrix
+from raytac.gel.pyramid import ElasticSurround
+from raytac.gel.surface import GelSurface, PadGrid, make_grid, rest_height
 from raytac.shapes.part import primitive
 from raytac.shapes.underside import object_height
 from raytac.specs.sensor import GelpadSpec
@@ -33,6 +33,32 @@ def press_sphere(
     pose[0, :3, 3] = *at, radius - depth
     surround = ElasticSurround(grid, contact_rule=rule)
     return surround.surface(object_height([primitive("sphere", (radius,))], pose, grid.x, grid.y), pose)
+
+
+def gaussian_by_cosines(nodes: int, width: float) -> np.ndarray:
+    """exp(½ width² L), L the second difference with mirrored ends, by its eigenvectors: cosines along the line."""
+    k = np.arange(nodes)
+    cosines = np.cos(math.pi / (nodes - 1) * np.outer(k, k))
+    weight = np.where((k == 0) | (k == nodes - 1), 0.5, 1.0)
+    gain = np.exp(width**2 * (np.cos(math.pi * k / (nodes - 1)) - 1.0))
+    return (cosines * gain) @ (2.0 / (nodes - 1) * weight[:, None] * cosines.T * weight)
+
+
+def pyramid_by_definition(grid: PadGrid, under: np.ndarray, rule: str, final: float) -> tuple[np.ndarray, np.ndarray]:
+    """Height and contact (Ny, Nx) of one pad: dense products in double precision on the whole grid."""
+    finest, u = 0.2 * min(grid.pitch), grid.rest - under
+    w, full = np.maximum(u, 0.0), u > CONTACT_SCALE * u.max()
+
+    def smooth(field: np.ndarray, sigma: float) -> np.ndarray:
+        along_y, along_x = (gaussian_by_cosines(n, sigma / d) for n, d in zip(grid.shape, reversed(grid.pitch), strict=True))
+        return along_y @ field @ along_x.T
+
+    for sigma in PYRAMID_SIGMAS:
+        if sigma > finest:
+            w = smooth(w, sigma)
+            w = np.maximum(w, u) if rule == "unilateral" else np.where(full, u, w)
+    contact = (u > 0.0) & (w <= u + 1e-5 * u.max()) if rule == "unilateral" else full
+    return grid.rest - (smooth(w, final) if final > finest else w), contact
 
 
 def test_grid_covers_the_pad_and_follows_the_dome() -> None:
@@ -56,63 +82,47 @@ def test_impossible_pitch_is_refused(pitch: float) -> None:
 @pytest.mark.parametrize("width", [0.3, 0.7, 1.5, 3.7, 5.9, 8.0, 14.0])
 def test_gaussian_has_its_variance_and_mirrors(width: float) -> None:
     nodes = 161
-    matrix = gaussian_matrix(nodes, width)
+    matrix, reach = gaussian_matrix(nodes, width, tail=1e-15)
     offset = np.arange(nodes) - 80.0
     np.testing.assert_allclose(matrix.sum(axis=1), 1.0, atol=1e-12)
     assert math.isclose(matrix[80] @ offset**2, width**2, rel_tol=1e-4)
-    k = 7  # cosines mirrored about the end nodes are its eigenvectors, also at the border
-    wave = np.cos(math.pi * k * np.arange(nodes) / (nodes - 1))
-    np.testing.assert_allclose(matrix @ wave, math.exp(width**2 * (math.cos(math.pi * k / (nodes - 1)) - 1.0)) * wave, atol=1e-12)
+    np.testing.assert_allclose(matrix, gaussian_by_cosines(nodes, width), atol=1e-12)
+    narrow, less = gaussian_matrix(nodes, width)
+    assert less < reach and np.abs(narrow - matrix).max() < 2e-6 * matrix.max() and not narrow[80, : 80 - less].any()
 
 
-@pytest.mark.parametrize("width", [0.3, 1.1, 3.7, 5.9, 6.1, 14.0])
-def test_fast_products_equal_the_dense_matrix(width: float) -> None:
-    field = np.random.default_rng(0).normal(size=(70, 91)).astype(np.float32)
-    dense = gaussian_matrix(70, width) @ field @ gaussian_matrix(91, width).T
-    np.testing.assert_allclose(GaussianBlur((70, 91), (1e-4, 1e-4), width * 1e-4)(field), dense, atol=3e-6)
+def test_a_gaussian_wider_than_its_line_is_mirrored_again_and_again() -> None:
+    np.testing.assert_allclose(gaussian_matrix(9, 6.0, tail=1e-15)[0], gaussian_by_cosines(9, 6.0), atol=1e-12)
 
 
 def test_wide_gaussian_agrees_with_scipy() -> None:
     from scipy.ndimage import gaussian_filter
 
-    field = np.random.default_rng(1).normal(size=(120, 150)).astype(np.float32)
-    expected = gaussian_filter(field.astype(float), 12.0, mode="mirror", truncate=6.0)
-    np.testing.assert_allclose(GaussianBlur((120, 150), (1.0, 1.0), 12.0)(field), expected, atol=1e-3 * np.abs(expected).max())
+    field = np.random.default_rng(1).normal(size=(120, 150))
+    expected = gaussian_filter(field, 12.0, mode="mirror", truncate=6.0)
+    smooth = gaussian_matrix(120, 12.0)[0] @ field @ gaussian_matrix(150, 12.0)[0].T
+    np.testing.assert_allclose(smooth, expected, atol=1e-3 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("final", [True, False])
-@pytest.mark.parametrize("corner", [(0, 0), (31, 40), (45, 70)])
-def test_a_field_followed_locally_is_that_of_the_whole_grid(corner: tuple[int, int], final: bool) -> None:
-    """Also where Gaussians are mirrored at the borders, and for any rule by which the field is set again."""
-    shape, pitch, sigmas = (60, 84), (1e-4, 0.9e-4), (8e-4, 3e-4, 1e-4, 0.4e-4)
-    touched = slice(corner[0], corner[0] + 13), slice(corner[1], corner[1] + 9)
-    window = slice(0, 60), slice(0, 84)
-    rng = np.random.default_rng(3)
-    values = rng.uniform(0.0, 1.0, (13, 9)).astype(np.float32)
-    blurs = [GaussianBlur(shape, pitch, s) for s in sigmas]
-    whole = WholeField(values, touched, window, blurs[:3], blurs[3] if final else None)
-    local = LocalField(values, touched, ComposedGaussians(shape, pitch, sigmas), 3, final, 4.8)
-    for _ in range(3):
-        one, other = whole.smooth(), local.smooth()
-        np.testing.assert_allclose(other, one, atol=5e-6)
-        laid = np.where(rng.uniform(size=one.shape) < 0.5, values, one)
-        whole.impose(laid.copy())
-        local.impose(laid)
-    np.testing.assert_allclose(local.over(window), whole.over(window), atol=1e-5)
-    assert whole.over(window).max() > 0.5
-
-
-def test_small_and_large_contacts_are_smoothed_alike(monkeypatch: pytest.MonkeyPatch) -> None:
-    for rule in ("unilateral", "threshold"):
-        for at in ((0.0, 0.0), (6e-3, -4.5e-3)):
-            local = press_sphere(0.1e-3, at=at, rule=rule)
-            with monkeypatch.context() as patch:
-                patch.setattr(ComposedGaussians, "fits", False)
-                whole = press_sphere(0.1e-3, at=at, rule=rule)
-            assert not np.array_equal(local.height, whole.height)  # they went two ways
-            np.testing.assert_allclose(local.height, whole.height, rtol=0.0, atol=1e-5 * 0.6e-3)
-            np.testing.assert_array_equal(local.contact, whole.contact)
-            np.testing.assert_allclose(local.contact_centre, whole.contact_centre, rtol=0.0, atol=1e-9)
+@pytest.mark.parametrize("rule", ["unilateral", "threshold"])
+@pytest.mark.parametrize("pitch", [0.45e-3, 0.2e-3, 0.09e-3])
+def test_surfaces_are_those_of_the_definition(pitch: float, rule: str) -> None:
+    """Balls in the middle, on an edge and in a corner, a box that turns up late in the batch, and a plate wider than the pad."""
+    grid, poses = make_grid(PAD, pitch), np.tile(np.eye(4), (4, 1, 1))
+    poses[:, :2, 3] = [(0.0, 0.0), (7.9e-3, 1e-3), (-8e-3, 6e-3), (3e-3, -2e-3)]
+    poses[:, 2, 3] = 3.5e-3, 3.2e-3, 3.3e-3, 0.6e-3
+    heights = object_height([primitive("sphere", (4e-3,))], poses, grid.x, grid.y)
+    heights[3] = object_height([primitive("box", (2e-3, 3e-3, 1e-3))], poses[3:], grid.x, grid.y)[0]
+    heights = np.concatenate([heights, np.full((1, *grid.shape), -0.2e-3)])
+    final = 2.0 * FINAL_SIGMA
+    surface = ElasticSurround(grid, contact_rule=rule, final_sigma=final, num_envs=2).surface(heights)
+    for b, under in enumerate(heights):
+        height, contact = pyramid_by_definition(grid, under, rule, final)
+        np.testing.assert_allclose(surface.height[b], height, rtol=0.0, atol=2e-9)
+        assert (surface.contact[b] != contact).sum() <= 2 and contact.any()
+        weight = np.where(surface.contact[b], grid.rest - under, 0.0)
+        centre = [(weight.sum(axis=0) @ grid.x) / weight.sum(), (weight.sum(axis=1) @ grid.y) / weight.sum()]
+        np.testing.assert_allclose(surface.contact_centre[b], centre, rtol=0.0, atol=1e-9)
 
 
 def test_no_contact_is_exactly_rest() -> None:
@@ -157,6 +167,18 @@ def test_a_slab_over_the_whole_pad_has_a_centre(depth: float) -> None:
     surface = ElasticSurround(grid).surface(np.full((1, *grid.shape), -depth))
     assert surface.contact.all()
     np.testing.assert_allclose(surface.contact_centre[0], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("final", [0.0, 0.5e-3])
+def test_without_gaussians_the_surface_is_the_objects(final: float) -> None:
+    """Or with the last one alone; the contact is the overlap."""
+    grid = make_grid(PAD, 0.25e-3)
+    under = object_height([primitive("sphere", (4e-3,))], np.eye(4)[None], grid.x, grid.y) + 3.4e-3
+    surface = ElasticSurround(grid, sigmas=(), final_sigma=final).surface(under)
+    overlap = np.maximum(grid.rest - under[0], 0.0)
+    along_y, along_x = (gaussian_by_cosines(n, final / d) for n, d in zip(grid.shape, reversed(grid.pitch), strict=True))
+    np.testing.assert_allclose(surface.indentation[0], along_y @ overlap @ along_x.T, rtol=0.0, atol=2e-9)
+    np.testing.assert_array_equal(surface.contact[0], overlap > 0.0)
 
 
 def test_unknown_contact_rule_is_refused() -> None:
@@ -204,37 +226,34 @@ def test_finer_grid_converges_to_one_surface() -> None:
     assert np.sqrt(np.mean(second**2)) < 3e-4 * 0.6e-3 and second.max() < 0.02 * 0.6e-3
 
 
-def test_environments_pressed_together_are_as_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Over the whole pad in one call, on a coarse grid, or around each contact, on a fine one: the same to rounding."""
-    grid = make_grid(PAD, 0.3e-3)
-    poses = np.tile(np.eye(4), (5, 1, 1))
-    poses[:, :2, 3] = [(0.0, 0.0), (6e-3, 4e-3), (-3e-3, 1e-3), (0.0, 0.0), (8e-3, -6e-3)]
-    poses[:, 2, 3] = 3.5e-3, 3.2e-3, 3.9e-3, 5.0e-3, 3.5e-3
-    heights = object_height([primitive("sphere", (4e-3,))], poses, grid.x, grid.y)
-    heights[2] = np.minimum(heights[2], -0.2e-3)  # as wide as the pad
-    for rule in ("unilateral", "threshold"):
-        together = ElasticSurround(grid, contact_rule=rule, final_sigma=0.1e-3).surface(heights)
-        with monkeypatch.context() as patch:
-            patch.setattr(pyramid, "_TOGETHER", 0)
-            each = ElasticSurround(grid, contact_rule=rule, final_sigma=0.1e-3).surface(heights)
-        assert not together.contact[3].any() and together.contact[[0, 1, 2, 4]].any(axis=(1, 2)).all()
-        np.testing.assert_allclose(together.height, each.height, atol=2e-9, rtol=0.0)
-        np.testing.assert_array_equal(together.contact, each.contact)
-        np.testing.assert_allclose(together.contact_centre, each.contact_centre, atol=1e-12, rtol=0.0)
-
-
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 @pytest.mark.parametrize("pitch", [0.15e-3, 0.4e-3])
-def test_batch_equals_single_bit_for_bit_and_nan_stays_alone(pitch: float) -> None:
+def test_batch_equals_single_bit_for_bit_and_nan_stays_alone(pitch: float, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     grid = make_grid(PAD, pitch)
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    poses[:, 0, 3] = 0.0, 1e-3, np.nan
-    poses[:, 2, 3] = 3.5e-3, 3.2e-3, 3.5e-3
+    monkeypatch.setattr(pyramid, "_STACK", 2 * grid.rest.size)  # two at a time
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :2, 3] = [(0.0, 0.0), (1e-3, 0.0), (0.0, 0.0), (6e-3, 4e-3), (8e-3, -6e-3)]
+    poses[:, 2, 3] = 3.5e-3, 3.2e-3, np.nan, 5.0e-3, 3.5e-3
     heights = object_height([primitive("sphere", (4e-3,))], poses, grid.x, grid.y)
-    surround = ElasticSurround(grid)
-    together = surround.surface(heights, poses)
-    for b in range(2):
-        alone = surround.surface(heights[b : b + 1])
+    single, batch = (ElasticSurround(grid, num_envs=count, device=device) for count in (1, 3))
+    together = batch.surface(heights, poses)
+    for b in range(5):
+        alone = single.surface(heights[b : b + 1])
         np.testing.assert_array_equal(together.height[b], alone.height[0])
         np.testing.assert_array_equal(together.contact[b], alone.contact[0])
         np.testing.assert_array_equal(together.contact_centre[b], alone.contact_centre[0])
-    assert np.isnan(together.height[2]).all() and not together.contact[2].any()
+    assert np.isnan(together.height[2]).all() and not together.contact[2].any() and np.isnan(together.contact_centre[2]).all()
+    assert not together.contact[3].any() and together.contact[[0, 1, 4]].any(axis=(1, 2)).all()
+    assert batch.surface(heights[:0]).batch == 0
+
+
+def test_a_gel_below_its_bonded_face_is_marked_in_its_environment_alone() -> None:
+    grid = make_grid(PAD, 0.4e-3)
+    ball = np.hypot(grid.x[None, :], grid.y[:, None]) < 2e-3
+    under = np.stack([np.where(ball, grid.rest - depth, np.inf) for depth in (0.5e-3, PAD.thickness + 2e-4, 0.5e-3)])
+    surface = ElasticSurround(grid, thickness=PAD.thickness, num_envs=3).surface(under)
+    np.testing.assert_array_equal(np.isnan(surface.height).all(axis=(1, 2)), [False, True, False])
+    np.testing.assert_array_equal(surface.contact.any(axis=(1, 2)), [True, False, True])
+    np.testing.assert_array_equal(np.isnan(surface.contact_centre[:, 0]), [False, True, False])
+    deep = ElasticSurround(grid, num_envs=3).surface(under)
+    assert np.isfinite(deep.height).all() and deep.height[1].min() < -PAD.thickness

@@ -3,57 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
 
 from raytac.errors import InputError
-from raytac.gel import ElasticSurround
-from raytac.gel.device_surround import DeviceSurround
 from raytac.gel.surface import make_grid
 from raytac.markers.device_fots import DeviceFots
 from raytac.markers.registry import markers_config
 from raytac.markers.tracker import MarkerTracker
+from raytac.physics.rigid.pressed_gel import PressedGel
 from raytac.physics.rigid.shear_state import ShearState
 from raytac.se3 import pose, rotations
-from raytac.shapes import object_height, primitive
+from raytac.shapes import primitive
 from raytac.specs import load_sensor
-from raytac.world.pad_touch import PadTouch
+from raytac.world.pad_surfaces import PadSurfaces
 from raytac.world.start_kernels import lose_marked
 
 SPEC = load_sensor("gelsight_mini_9x11")
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
-
-
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("pitch", [0.4e-3, 0.15e-3])
-def test_the_surround_is_that_of_the_host(pitch: float, device: str) -> None:
-    """Balls, boxes and two at once, at random places and depths, one pad untouched and one that is not sound."""
-    grid, rng = make_grid(SPEC.gelpad, pitch), np.random.default_rng(0)
-    x, y = np.meshgrid(grid.x, grid.y)
-    under = np.full((7, *grid.shape), np.inf)
-    for b in range(6):
-        for _ in range(1 + b % 2):
-            (cx, cy), size, depth = rng.uniform(-5e-3, 5e-3, 2), rng.uniform(2e-3, 5e-3), rng.uniform(1e-4, 1e-3)
-            across = (x - cx) ** 2 + (y - cy) ** 2
-            ball = np.where(across < size**2, size - depth - np.sqrt(np.maximum(size**2 - across, 0.0)), np.inf)
-            box = np.where((np.abs(x - cx) < size) & (np.abs(y - cy) < 0.5 * size), -depth, np.inf)
-            under[b] = np.minimum(under[b], ball if b < 3 else box)
-    under[under > grid.rest] = np.inf
-    expected = ElasticSurround(grid).surface(under)
-    found = DeviceSurround(grid, SPEC.gelpad.thickness, num_envs=7, device=device)
-    sound = np.ones(7, bool)
-    sound[5] = False
-    depths = (grid.rest - under).max(axis=(1, 2))[:, None]
-    arrays = [wp.array(under, dtype=wp.float64, device=device), wp.array(depths, dtype=wp.float64, device=device)]
-    for _ in range(2):  # nothing is left of the first time
-        found.launch(arrays[0], arrays[1], wp.array(sound, dtype=wp.bool, device=device))
-    height, contact = found.height.numpy(), found.contact.numpy().astype(bool)
-    np.testing.assert_allclose(height[sound], expected.height[sound], rtol=0.0, atol=1e-9)
-    assert (contact[sound] != expected.contact[sound]).sum() <= 2 and contact[:5].any(axis=(1, 2)).all()
-    np.testing.assert_array_equal(height[5], grid.rest.astype(np.float32))
-    assert not contact[5].any() and not contact[6].any() and not found.pierced.numpy().any()
 
 
 class Both:
@@ -62,30 +32,29 @@ class Both:
     def __init__(self, markers: str, count: int, *, device: str = "cpu", patches: int = 8) -> None:
         grid, config = make_grid(SPEC.gelpad, 0.4e-3), markers_config(markers)
         self.tracker = MarkerTracker(SPEC, config, grid, num_envs=count, device="cpu")
-        self.host = ElasticSurround(grid)
         parts = [primitive("sphere", (3e-3,)) for _ in range(2)]
         self.parts = [
             replace(part, object_from_part=pose(np.eye(3), np.array([side * 4e-3, 0.0, 0.0])))
             for part, side in zip(parts, (-1, 1), strict=True)
         ]
-        self.surround = DeviceSurround(grid, SPEC.gelpad.thickness, num_envs=count, device=device)
+        self.gel = PressedGel(grid, SPEC.gelpad.thickness, [self.parts], num_envs=count, device=device)
+        self.host = PadSurfaces({"pad": SPEC.gelpad}, [self.parts], count)
         self.fots = DeviceFots(SPEC, config, grid, num_envs=count, patches=patches, device=device)
         self.shear, self.grid, self.device = ShearState(count, 1, 2, device=device), grid, device
-        self.sound = wp.full(count, value=True, dtype=wp.bool, device=device)
 
     def at(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Displacements (B, M, 2) of the host and of the kernels, and the greatest error of heights, with bodies at poses (B, 4, 4)."""
-        under = object_height(self.parts, poses, self.grid.x, self.grid.y, below=float(self.grid.rest.max()))
-        under[under > self.grid.rest] = np.inf
-        depth = (self.grid.rest - under).max(axis=(1, 2))
-        shown = np.where((depth > 0.0)[:, None, None], poses, np.nan)
-        surface = self.host.surface(under, shown)
-        arrays = [wp.array(values, dtype=wp.float64, device=self.device) for values in (under, depth[:, None])]
-        self.surround.launch(arrays[0], arrays[1], self.sound)
-        moved = wp.array(np.stack([poses, poses], axis=1)[:, None], dtype=wp.mat44d, device=self.device)
-        self.fots.launch(self.surround.height, self.surround.contact, moved, 0, arrays[1], self.sound, self.shear.struct)
-        error = np.abs(self.surround.height.numpy() - surface.height).max(axis=(1, 2))
-        return self.tracker.update(surface).displacement, self.fots.displacement.numpy(), error
+        count, gel = len(poses), self.gel
+        reading = self.host.reading(
+            "pad", self.grid, poses[:, None], np.zeros((count, 6)), np.zeros(count, bool), np.arange(count)
+        )
+        moved: Any = wp.array(np.stack([poses, poses], axis=1)[:, None], dtype=wp.mat44d, device=self.device)
+        wp.copy(gel.poses, moved[:, 0, :1])
+        gel.sound.fill_(True)
+        gel.launch()
+        self.fots.launch(gel.surround.height, gel.surround.contact, moved, 0, gel.depth, gel.sound, self.shear.struct)
+        error = np.abs(gel.surround.height.numpy() - reading.surface.height).max(axis=(1, 2))
+        return self.tracker.update(reading.surface).displacement, self.fots.displacement.numpy(), error
 
 
 def motion(step: int, count: int) -> np.ndarray:
@@ -127,16 +96,20 @@ def test_more_contacts_than_there_is_memory_for_are_an_error_that_names_it() -> 
 
 
 def test_a_gel_below_its_bonded_face_is_not_shown_as_sound() -> None:
-    grid = make_grid(SPEC.gelpad, 0.4e-3)
-    x, y = np.meshgrid(grid.x, grid.y)
-    under = np.where(x**2 + y**2 < 4e-6, grid.rest - SPEC.gelpad.thickness - 2e-4, np.inf)[None]
-    touch = PadTouch(SPEC, grid, [], None, pad=0, num_envs=1)
-    touch._surround.launch(
-        wp.array(under, dtype=wp.float64),
-        wp.array([[SPEC.gelpad.thickness + 2e-4]], dtype=wp.float64),
-        wp.full(1, value=True, dtype=wp.bool),
-    )
-    active = wp.full(1, value=True, dtype=wp.bool)
-    wp.launch(lose_marked, dim=1, inputs=[touch._surround.pierced, active])
-    assert not active.numpy()[0]
-    np.testing.assert_array_equal(touch.height.numpy()[0], grid.rest.astype(np.float32))
+    """A plate wider than the pad: the Gaussians, mirrored at the borders, press the dome's flanks deeper than the plate is."""
+    grid, plate = make_grid(SPEC.gelpad, 0.4e-3), [primitive("box", (20e-3, 20e-3, 1e-3))]
+    gel = PressedGel(grid, SPEC.gelpad.thickness, [plate], num_envs=3)
+    poses = np.tile(np.eye(4), (3, 1, 1, 1))
+    poses[:, 0, 2, 3] = 1e-3 - np.array([1e-3, SPEC.gelpad.thickness - 1e-5, 1e-3])
+    pressed = gel.of(poses, np.ones(3, bool))
+    np.testing.assert_array_equal(pressed.lost, [False, True, False])
+    np.testing.assert_array_equal(pressed.height[1], grid.rest.astype(np.float32))
+    assert not pressed.contact[1].any() and pressed.contact[0].any()
+    active = wp.full(3, value=True, dtype=wp.bool)
+    wp.launch(lose_marked, dim=3, inputs=[gel.surround.lost, active])
+    np.testing.assert_array_equal(active.numpy(), [True, False, True])
+    failed, rows = np.zeros(3, bool), np.arange(3)
+    reading = PadSurfaces({"pad": SPEC.gelpad}, [plate], 3).reading("pad", grid, poses, np.zeros((3, 6)), failed, rows)
+    np.testing.assert_array_equal(reading.failed, [False, True, False])
+    assert np.isnan(reading.surface.height[1]).all() and np.isnan(reading.wrench[1]).all()
+    np.testing.assert_array_equal(reading.surface.height[0], pressed.height[0])

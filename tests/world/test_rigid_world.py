@@ -64,8 +64,11 @@ def test_frame_has_the_names_units_and_totals_of_a_press() -> None:
     np.testing.assert_array_equal(frame.wrench, wrench)
     from raytac.gel.traction import cell_areas
 
-    total = (frame.traction[0] * cell_areas(frame.surface.grid)[..., None]).sum(axis=(0, 1))
-    np.testing.assert_allclose(total, wrench[0, :3], atol=1e-5)
+    grid = frame.surface.grid
+    force = frame.traction[0] * cell_areas(grid)[..., None]
+    np.testing.assert_allclose(force.sum(axis=(0, 1)), wrench[0, :3], atol=1e-5)
+    torque = (grid.x * force[..., 1] - grid.y[:, None] * force[..., 0]).sum()
+    assert torque == pytest.approx(wrench[0, 5], abs=1e-9)
     assert frame.contact_area[0] > 1e-6 and "contact_cells" not in frame.outputs
     deepest = float(frame.surface.indentation.max())
     assert deepest == pytest.approx(0.005 - world.state().world_from_body["ball"][0, 2, 3], abs=2e-6)

@@ -12,7 +12,7 @@ import numpy as np
 
 from raytac.checks import is_number, is_whole
 from raytac.errors import CalibrationError
-from raytac.gel.pyramid import CONTACT_SCALE, PYRAMID_SIGMAS
+from raytac.gel.gaussian import CONTACT_SCALE, PYRAMID_SIGMAS
 from raytac.optics.taxim.restricted_pickle import file_bytes
 from raytac.optics.taxim.table import PolyTable, ShadowTable, TaximConstants
 

@@ -89,6 +89,15 @@ def place_of(pose: wp.mat44d) -> wp.vec3d:
 
 
 @wp.func
+def is_finite(pose: wp.mat44d) -> wp.bool:
+    total = wp.float64(0.0)
+    for i in range(3):
+        for j in range(4):
+            total += wp.abs(pose[i, j])
+    return wp.isfinite(total)
+
+
+@wp.func
 def turned_by(one: wp.mat33d, other: wp.mat33d) -> wp.float64:
     """Angle [rad] between two rotations, of which it is an upper bound by rounding."""
     apart = one - other

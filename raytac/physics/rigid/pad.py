@@ -8,7 +8,6 @@ from typing import Unpack
 import numpy as np
 
 from raytac.errors import InputError, SpecError
-from raytac.gel.pierced import without_pierced
 from raytac.gel.pyramid import ElasticSurround
 from raytac.gel.surface import GelSurface
 from raytac.gel.traction import foundation_traction
@@ -59,7 +58,7 @@ class RigidPad(PressPad):
             choices = tuple(name for name in DYNAMICS if name != "soft")
             raise SpecError(rule, file=scene.source, key="object.dynamics", value="soft", choices=choices)
         super().__init__(sensor, scene, **settings)
-        self._surround = ElasticSurround(self.grid)
+        self._surround = ElasticSurround(self.grid, thickness=sensor.gelpad.thickness)
         self._touches: dict[bytes, tuple[float, LoadLaw]] = {}
         self._environments: list[_Environment] = []
         """State of every environment at the last reading; empty before, and without an object."""
@@ -99,7 +98,7 @@ class RigidPad(PressPad):
         """
         highest = float(self.grid.rest.max())
         height = object_height(self.parts, pad_from_object, self.grid.x, self.grid.y, below=highest)
-        return without_pierced(self._surround.surface(height, pad_from_object if self.parts else None), self.sensor.gelpad)
+        return self._surround.surface(height, pad_from_object if self.parts else None)
 
     def _start_of(self, b: int) -> _Environment:
         x, y = np.asarray(self.scene.object.position[:2]) + self.targets.offsets[b]

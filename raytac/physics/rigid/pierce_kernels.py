@@ -15,8 +15,8 @@ from __future__ import annotations
 import warp as wp
 
 from raytac.physics.rigid.contact_rows import LAST
-from raytac.physics.rigid.motion_kernels import place_of, pose_of, turn_of
-from raytac.physics.rigid.placed_kernels import Pads, is_finite, nodes_within
+from raytac.physics.rigid.motion_kernels import is_finite, place_of, pose_of, turn_of
+from raytac.physics.rigid.placed_kernels import Pads, nodes_within
 from raytac.physics.rigid.shape_kernels import Shapes, first_hit, infinity, part_box
 from raytac.physics.rigid.world_kernels import Motion, Steps
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from raytac.physics.rigid.motion_kernels import place_of, turn_of
 from raytac.physics.rigid.shape_kernels import Shapes, first_hit, infinity, part_box, under_primitive, under_surface
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -77,20 +78,6 @@ def across() -> wp.int32:
 
 
 @wp.func
-def is_finite(pose: wp.mat44d) -> wp.bool:
-    total = wp.float64(0.0)
-    for i in range(3):
-        for j in range(4):
-            total += wp.abs(pose[i, j])
-    return wp.isfinite(total)
-
-
-@wp.func
-def rotation_of(pose: wp.mat44d) -> wp.mat33d:
-    return wp.mat33d(pose[0, 0], pose[0, 1], pose[0, 2], pose[1, 0], pose[1, 1], pose[1, 2], pose[2, 0], pose[2, 1], pose[2, 2])
-
-
-@wp.func
 def bottom_near(
     shapes: Shapes, part: wp.int32, rotation: wp.mat33d, at: wp.vec3d, pads: Pads, pad: wp.int32, reach: wp.float64
 ) -> wp.float64:
@@ -114,8 +101,8 @@ def bottom_near(
 @wp.func
 def lowest_of(shapes: Shapes, part: wp.int32, pose: wp.mat44d, pads: Pads, pad: wp.int32, reach: wp.float64) -> wp.float64:
     """``bottom_near`` of a part of a body at a pose."""
-    rotation = rotation_of(pose)
-    at = rotation * shapes.offset[part] + wp.vec3d(pose[0, 3], pose[1, 3], pose[2, 3])
+    rotation = turn_of(pose)
+    at = rotation * shapes.offset[part] + place_of(pose)
     return bottom_near(shapes, part, rotation * shapes.rotation[part], at, pads, pad, reach)
 
 
@@ -144,8 +131,7 @@ def place_parts(
     count = shapes.first_part[body + 1] - first
     if lane == 0:
         placed.count[block] = count
-    turn = rotation_of(pose)
-    origin = wp.vec3d(pose[0, 3], pose[1, 3], pose[2, 3])
+    turn, origin = turn_of(pose), place_of(pose)
     k = wp.int32(lane)
     while k < count:
         part = first + k

@@ -16,6 +16,7 @@ import warp as wp
 from raytac.physics.rigid.contact_rows import LAST, Rows, missing_row, place_of_gap
 from raytac.physics.rigid.cover_kernels import add_outline
 from raytac.physics.rigid.law_kernels import DEEPER, Bins, add_node, clear_bins, deepest_of, most_deepest, tabulate
+from raytac.physics.rigid.motion_kernels import is_finite
 from raytac.physics.rigid.node_kernels import (
     between_nodes,
     box_around,
@@ -32,7 +33,6 @@ from raytac.physics.rigid.placed_kernels import (
     Placed,
     across,
     bottom_of,
-    is_finite,
     larger,
     lowest_of,
     place_parts,

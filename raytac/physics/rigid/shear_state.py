@@ -67,11 +67,11 @@ class ShearState:
 
     def of(self, envs: np.ndarray, pad: int, body: np.ndarray) -> ContactShear:
         """Shear of one contact of each environment; body −1 is none."""
-        rows = envs, np.full(len(envs), pad), np.maximum(body, 0)
-        load = self.load[rows][:, 0]
+        rows = envs, pad, np.maximum(body, 0)
+        load = self.load[*rows, 0]
         touched = (body >= 0) & (load > 0.0)
         mean = np.where(touched[:, None], self.mean[rows], 0.0)
-        force = np.linalg.norm(mean[:, :2], axis=1) * self.stiffness[rows][:, 0]
+        force = np.sqrt(mean[:, 0] ** 2 + mean[:, 1] ** 2) * self.stiffness[*rows, 0]
         share = np.minimum(force / np.where(touched, load, 1.0), 1.0)
         stuck = np.where(touched, np.cbrt(1.0 - share), 0.0)
         return ContactShear(mean[:, :2], mean[:, 2], stuck, np.where(touched[:, None], self.centre[rows], 0.0))

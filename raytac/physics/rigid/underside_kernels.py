@@ -1,4 +1,4 @@
-"""Kernels of ``Undersides``: parts placed before a pad, undersides by rows, overlaps."""
+"""Kernels of ``PressedGel``: parts placed before a pad, undersides by rows, overlaps."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from raytac.physics.rigid.motion_kernels import place_of, turn_of
 from raytac.physics.rigid.shape_kernels import Shapes, direction_of, first_hit, infinity, line_through, part_box
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -32,8 +33,10 @@ class Nodes:
     rest: wp.array2d(dtype=wp.float64)
     """(Ny, Nx)."""
     highest: wp.float64
-    bond: wp.float64
-    """z of the face that the gel is bonded to."""
+    share: wp.array(dtype=wp.float64)
+    """Share of the overlap with each body by which it presses the gel in, (bodies,)."""
+    bond: wp.array(dtype=wp.float64)
+    """z of the face that the gel is bonded to, below which a body is not shown, (bodies,)."""
 
 
 @wp.struct
@@ -62,21 +65,20 @@ def nodes_between(line: wp.array(dtype=wp.float64), low: wp.float64, high: wp.fl
 
 @wp.kernel
 def place(
-    poses: wp.array2d(dtype=wp.mat44d), sound: wp.array(dtype=wp.int32), shapes: Shapes, nodes: Nodes,
+    poses: wp.array2d(dtype=wp.mat44d), sound: wp.array(dtype=wp.bool), shapes: Shapes, nodes: Nodes,
     # outputs
     before: Before,
 ):  # fmt: skip
     """Place the parts of a body before a pad, by (pad, body)."""
     env, body = wp.tid()
     pose = poses[env, body]
-    turn = wp.mat33d(pose[0, 0], pose[0, 1], pose[0, 2], pose[1, 0], pose[1, 1], pose[1, 2], pose[2, 0], pose[2, 1], pose[2, 2])
-    origin = wp.vec3d(pose[0, 3], pose[1, 3], pose[2, 3])
+    turn, origin = turn_of(pose), place_of(pose)
     half_x, half_y = nodes.x[nodes.x.shape[0] - 1], nodes.y[nodes.y.shape[0] - 1]
     for part in range(shapes.first_part[body], shapes.first_part[body + 1]):
         rotation = turn * shapes.rotation[part]
         at = turn * shapes.offset[part] + origin
         window, bottom = wp.vec4i(0, 0, 0, 0), infinity()
-        if sound[env] != 0:
+        if sound[env] and nodes.share[body] > _0:
             if shapes.kind[part] == _PLANE:
                 n = wp.vec3d(rotation[0, 2], rotation[1, 2], rotation[2, 2])
                 if n[2] < _0:
@@ -125,21 +127,21 @@ def steepest(d: wp.vec3d) -> wp.vec3i:
 def lower(
     shapes: Shapes, nodes: Nodes, before: Before,
     # outputs
-    height: wp.array3d(dtype=wp.float64),
+    overlap: wp.array3d(dtype=wp.float32),
     written: wp.array2d(dtype=wp.vec2i),
     depth: wp.array3d(dtype=wp.float64),
     behind: wp.array3d(dtype=wp.int32),
 ):  # fmt: skip
-    """Undersides of all bodies along one row of nodes, by (pad, row).
+    """Overlap of all bodies with the gel along one row of nodes, by (pad, row).
 
-    ``height`` is inf before; ``written``: columns that it is lowered in. ``depth`` (B, Ny, bodies): greatest overlap with the gel,
-    −inf without; ``behind``: 1 where a body is beyond the bonded face.
+    ``overlap`` is 0 before; ``written``: columns that it is raised in. ``depth`` (B, Ny, bodies): greatest overlap of each, −inf without;
+    ``behind``: 1 where a body is beyond the bonded face.
     """
     env, row = wp.tid()
     from_, to = nodes.x.shape[0], wp.int32(0)
     y = nodes.y[row]
     for body in range(depth.shape[2]):
-        most, beyond = -infinity(), wp.int32(0)
+        most, beyond, share = -infinity(), wp.int32(0), nodes.share[body]
         for part in range(shapes.first_part[body], shapes.first_part[body + 1]):
             window = before.window[env, part]
             if row >= window[2] and row < window[3]:
@@ -171,12 +173,12 @@ def lower(
                         else:
                             z = first_hit(shapes, part, rotation, at, x, y)
                         if z < rest:
-                            if z < nodes.bond:
+                            if z < nodes.bond[body]:
                                 beyond = wp.int32(1)
                             else:
-                                most = wp.max(most, rest - z)
-                                if z < height[env, row, i]:
-                                    height[env, row, i] = z
+                                u = share * (rest - z)
+                                most = wp.max(most, u)
+                                overlap[env, row, i] = wp.max(overlap[env, row, i], wp.float32(u))
                                 from_, to = wp.min(from_, i), wp.max(to, i + 1)
         depth[env, row, body] = most
         behind[env, row, body] = beyond
@@ -188,21 +190,25 @@ def join_rows(
     written: wp.array2d(dtype=wp.vec2i), depth: wp.array3d(dtype=wp.float64), behind: wp.array3d(dtype=wp.int32),
     # outputs
     window: wp.array(dtype=wp.vec4i),
-    deepest: wp.array2d(dtype=wp.float64),
+    deepest: wp.array(dtype=wp.float32),
+    depths: wp.array2d(dtype=wp.float64),
     beyond: wp.array2d(dtype=wp.int32),
 ):  # fmt: skip
     """Join the findings of a pad's rows, by pad.
 
-    ``window``: columns from, to and rows from, to of the nodes where a body is lower than the gel; zeros for none.
+    ``window``: columns from, to and rows from, to of the nodes where a body is lower than the gel; zeros for none. ``deepest``: greatest
+    overlap, 0 for none; ``depths``: of each body.
     """
     env = wp.tid()
-    rows = written.shape[1]
+    rows, greatest = written.shape[1], wp.float64(0.0)
     for body in range(depth.shape[2]):
         most, any_ = -infinity(), wp.int32(0)
         for row in range(rows):
             most, any_ = wp.max(most, depth[env, row, body]), wp.max(any_, behind[env, row, body])
-        deepest[env, body] = most
+        depths[env, body] = most
+        greatest = wp.max(greatest, most)
         beyond[env, body] = any_
+    deepest[env] = wp.float32(greatest)
     span = wp.vec4i(2147483647, 0, rows, 0)
     for row in range(rows):
         line = written[env, row]

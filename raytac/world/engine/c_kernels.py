@@ -14,28 +14,25 @@ import warp as wp
 
 from raytac.physics.rigid.motion_kernels import Frames
 from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
+from raytac.world.engine.shared_kernels import (
+    LEAST_FRICTION,
+    closing,
+    correct_lift,
+    is_among,
+    is_box,
+    is_open,
+    passes,
+    slide_force,
+)
 from raytac.world.world_state import LARGEST_SPEED
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _ROWS = wp.constant(wp.int32(ROWS))
-_LEAST = wp.constant(wp.float64(1e-6))
-"""Least coefficient of friction, which MuJoCo wants positive."""
-_BACK = wp.constant(wp.float64(0.1))
-"""Share of a penetration that a step takes back."""
-_FITS = wp.constant(wp.float64(0.005))
-"""Error of a lift over the normal force that is left."""
-_BESIDE = wp.constant(wp.float64(1e-4))
-"""Distance from a box from which a point of a gap is not on it [m]."""
-_OPEN = wp.constant(wp.float64(2e-5))
-"""Gap [m] of a contact without friction before and after a step; load closes it nearer."""
 _SLIPPERY = wp.constant(wp.float64(1e-5))
 """Factor of the friction across a gap that stays open; of all coefficients and the cone, so that they fit each other."""
-_FAR = wp.constant(wp.float64(1.0))
-"""Gap that no step closes [m]."""
 _SLOWEST = wp.constant(wp.float64(1e-9))
 """Least speed by which a gap is divided [m/s]."""
-_HALF = wp.constant(wp.float64(0.5))
 _LARGEST_SPEED = wp.constant(wp.float64(LARGEST_SPEED))
 _MANY = wp.constant(wp.int32(0x7FFFFFFF))
 _0 = wp.constant(wp.float64(0.0))
@@ -117,8 +114,13 @@ def vector(values: wp.array(dtype=wp.float64), index: wp.int32) -> wp.vec3d:
 
 
 @wp.func
+def matrix_at(values: wp.array(dtype=wp.float64), first: wp.int32) -> wp.mat33d:
+    return wp.matrix_from_rows(vector_at(values, first), vector_at(values, first + 3), vector_at(values, first + 6))
+
+
+@wp.func
 def matrix(values: wp.array(dtype=wp.float64), index: wp.int32) -> wp.mat33d:
-    return wp.matrix_from_rows(vector(values, 3 * index), vector(values, 3 * index + 1), vector(values, 3 * index + 2))
+    return matrix_at(values, 9 * index)
 
 
 @wp.func
@@ -204,7 +206,7 @@ def write_contacts(memory: Memory, steps: Steps, slots: Slots, gels: wp.array(dt
                     m += 1
                 m = wp.int32(0)
                 while m < _ROWS - 1:
-                    contact[first + memory.friction + m] = wp.max(slots.friction[i, pad, body, m], _LEAST)
+                    contact[first + memory.friction + m] = wp.max(slots.friction[i, pad, body, m], LEAST_FRICTION)
                     m += 1
                 integer[2 * first + memory.geom1] = gels[pad]
                 integer[2 * first + memory.geom2] = others[body]
@@ -238,16 +240,8 @@ def write_regularisation(memory: Memory, steps: Steps, slots: Slots):
                     m += 1
                 # The solver's cone is that of the dual one with the rows scaled by √R.
                 ratio = slots.regularisation[i, pad, body, 1] / slots.regularisation[i, pad, body, 0]
-                contact[k + memory.mu] = wp.max(slots.friction[i, pad, body, 0], _LEAST) * wp.sqrt(ratio)
+                contact[k + memory.mu] = wp.max(slots.friction[i, pad, body, 0], LEAST_FRICTION) * wp.sqrt(ratio)
                 k += memory.size
-
-
-@wp.func
-def is_among(geoms: wp.array(dtype=wp.int32), geom: wp.int32) -> wp.int32:
-    """Entry of a geom; 0 of −1, which is a flex."""
-    if geom < 0:
-        return 0
-    return geoms[geom]
 
 
 @wp.func
@@ -263,36 +257,6 @@ def row_times(memory: Memory, env: wp.int32, row: wp.int32, values: wp.array(dty
         for k in range(memory.nv):
             result += jacobian[row * memory.nv + k] * values[k]
     return result
-
-
-@wp.func
-def is_box(boxes: wp.array(dtype=wp.vec3d), geom: wp.int32) -> wp.bool:
-    """False of −1, which is a flex."""
-    if geom < 0:
-        return False
-    return boxes[geom][0] > wp.float64(0.0)
-
-
-@wp.func
-def beside_box(memory: Memory, env: wp.int32, geom: wp.int32, half: wp.vec3d, point: wp.vec3d) -> wp.float64:
-    """Distance [m] of a point from a box, along the axis on which it is farthest out; 0 inside."""
-    turn = matrix(doubles(memory, env, memory.geom_xmat), geom)
-    local = wp.transpose(turn) * (point - vector(doubles(memory, env, memory.geom_xpos), geom))
-    return wp.max(wp.max(wp.abs(local[0]) - half[0], wp.abs(local[1]) - half[1]), wp.max(wp.abs(local[2]) - half[2], _0))
-
-
-@wp.func
-def passes(
-    memory: Memory, env: wp.int32, one: wp.int32, two: wp.int32, boxes: wp.array(dtype=wp.vec3d), near: wp.vec3d, far: wp.vec3d,
-    moved: wp.vec3d,
-) -> wp.bool:  # fmt: skip
-    """True if two boxes pass each other, so that their gap is no contact once it is closed.
-
-    Its points ``near`` and ``far`` are not on the boxes, or neither is on the other box once the second one has moved.
-    """
-    off = wp.max(beside_box(memory, env, one, boxes[one], near), beside_box(memory, env, two, boxes[two], far))
-    by = wp.min(beside_box(memory, env, one, boxes[one], far + moved), beside_box(memory, env, two, boxes[two], near - moved))
-    return wp.max(off, by) > _BESIDE
 
 
 @wp.kernel
@@ -316,23 +280,21 @@ def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(
         if first >= 0 and integer[at + memory.dim] >= 3 and is_among(hard, one) + is_among(hard, two) > 0:
             n = k * memory.size
             gap = contact[n + memory.dist]
-            # A gap is closed by the step exactly, and a penetration is taken back slowly.
-            wanted = wp.where(gap > _0, gap, _BACK * gap) / step
-            open = wp.bool(False)
+            open, passed = wp.bool(False), wp.bool(False)
             ahead = wp.vec3d()
             if gap > _0:
                 for m in range(3):
                     ahead[m] = velocity[first + m] + step * row_times(memory, env, first + m, smooth)
-                open = gap > _OPEN and gap + step * ahead[0] > _OPEN
                 if is_box(boxes, one) and is_box(boxes, two):
-                    at = n + memory.frame
-                    frame = wp.matrix_from_rows(vector_at(contact, at), vector_at(contact, at + 3), vector_at(contact, at + 6))
-                    middle, shift = vector_at(contact, n + memory.pos), _HALF * gap * frame[0]
-                    until = wp.min(step, gap / wp.max(-ahead[0], _SLOWEST))
-                    moved = wp.transpose(frame) * wp.vec3d(-gap, until * ahead[1], until * ahead[2])
-                    if passes(memory, env, one, two, boxes, middle - shift, middle + shift, moved):
-                        wanted, open = _FAR / step, wp.bool(True)
-            reference[first] = -(velocity[first] + wanted) / step
+                    turns, places = doubles(memory, env, memory.geom_xmat), doubles(memory, env, memory.geom_xpos)
+                    passed = passes(
+                        matrix(turns, one), vector(places, one), boxes[one],
+                        matrix(turns, two), vector(places, two), boxes[two],
+                        vector_at(contact, n + memory.pos), matrix_at(contact, n + memory.frame),
+                        gap, ahead, wp.min(step, gap / wp.max(-ahead[0], _SLOWEST)),
+                    )  # fmt: skip
+                open = passed or is_open(gap, ahead[0], step)
+            reference[first] = -(velocity[first] + closing(gap, passed) / step) / step
             for m in range(1, 3):
                 reference[first + m] = -velocity[first + m] / step
             if open:
@@ -356,8 +318,7 @@ def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(
 def correct_lifts(memory: Memory, steps: Steps, slots: Slots):
     """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step.
 
-    A slide that is faster by a lift that is larger asks for more: the first guess follows from the contact's own mass, the others by
-    secants. ``steps.slides`` stays 1 until the lift fits.
+    ``steps.slides`` stays 1 until all fit.
     """
     i = wp.tid()
     if steps.slides[i] == 0 or steps.lost[i] != 0:
@@ -375,32 +336,17 @@ def correct_lifts(memory: Memory, steps: Steps, slots: Slots):
     for pad in range(slots.held.shape[1]):
         for body in range(slots.held.shape[2]):
             if slots.held[i, pad, body] != 0:
-                lift = slots.lift[i, pad, body]
-                regular, sheared = slots.regularisation[i, pad, body, 0], slots.regularisation[i, pad, body, 1]
-                friction, ratio = wp.max(slots.friction[i, pad, body, 0], _LEAST), sheared / regular
-                ahead = before[row] + step * row_times(memory, env, row, acceleration)
-                normal = wp.max(slots.force[i, pad, body, 0] + lift - ahead / (regular * step), _0)
-                total = wp.float64(0.0)
+                ahead, total = before[row] + step * row_times(memory, env, row, acceleration), wp.float64(0.0)
                 m = wp.int32(1)
                 while m < _ROWS:
-                    ahead = before[row + m] + step * row_times(memory, env, row + m, acceleration)
-                    part = slots.force[i, pad, body, m] - ahead / (slots.regularisation[i, pad, body, m] * step)
-                    part *= friction / wp.max(slots.friction[i, pad, body, m - 1], _LEAST)
-                    total += part * part
+                    slide = before[row + m] + step * row_times(memory, env, row + m, acceleration)
+                    force = slide_force(slots, i, pad, body, m, slide, step)
+                    total += force * force
                     m += 1
-                lacks = friction * ratio * wp.max(wp.sqrt(total) - friction * normal, _0) - lift
-                if wp.abs(lacks) > _FITS * normal:
+                lacks, less = correct_lift(slots, i, pad, body, ahead, wp.sqrt(total), step)
+                if lacks:
                     slides = 1
-                    tried = slots.tried[i, pad, body]
-                    square = friction * friction * ratio
-                    more = lacks * (_1 + square * slots.compliance[i, pad, body] / sheared / (_1 + square))
-                    if not wp.isnan(tried[0]) and tried[1] != lacks:
-                        more = lacks * (lift - tried[0]) / (tried[1] - lacks)
-                    slots.tried[i, pad, body] = wp.vec2d(lift, lacks)
-                    more = wp.max(more, -lift)
-                    slots.lift[i, pad, body] = lift + more
-                    slots.force[i, pad, body, 0] = slots.force[i, pad, body, 0] - more
-                    reference[row] = reference[row] - more * regular
+                    reference[row] = reference[row] - less
                 row += _ROWS
     steps.slides[i] = slides
 

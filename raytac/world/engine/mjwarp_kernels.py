@@ -17,6 +17,16 @@ import warp as wp
 
 from raytac.physics.rigid.motion_kernels import Frames
 from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
+from raytac.world.engine.shared_kernels import (
+    LEAST_FRICTION,
+    closing,
+    correct_lift,
+    is_among,
+    is_box,
+    is_open,
+    passes,
+    slide_force,
+)
 from raytac.world.world_state import LARGEST_SPEED
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -24,20 +34,8 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 vec5 = wp.types.vector(length=5, dtype=wp.float32)
 
 _ROWS = wp.constant(wp.int32(ROWS))
-_LEAST = wp.constant(wp.float64(1e-6))
-"""Least coefficient of friction, which MuJoCo wants positive."""
-_BACK = wp.constant(wp.float32(0.1))
-"""Share of a penetration that a step takes back."""
-_FITS = wp.constant(wp.float64(0.005))
-"""Error of a lift over the normal force that is left."""
-_BESIDE = wp.constant(wp.float32(1e-4))
-"""Distance from a box from which a point of a gap is not on it [m]."""
-_OPEN = wp.constant(wp.float32(2e-5))
-"""Gap [m] of a contact without friction before and after a step; load closes it nearer."""
 _SLIPPERY = wp.constant(wp.float32(1e-5))
 """Factor of the friction across a gap that stays open."""
-_FAR = wp.constant(wp.float32(1.0))
-"""Gap that no step closes [m]."""
 _SLOWEST = wp.constant(wp.float32(1e-6))
 """Least speed by which a gap is divided [m/s]."""
 _LARGEST_SPEED = wp.constant(wp.float32(LARGEST_SPEED))
@@ -311,7 +309,7 @@ def append_contacts(
             axes[m, n] = wp.float32(factor * frame[m, n])
     for m in range(5):
         factor = wp.where(is_scaled(m + 1), t, _1)
-        friction[m] = wp.float32(wp.max(slots.friction[i, pad, body, m], _LEAST) / factor)
+        friction[m] = wp.float32(wp.max(slots.friction[i, pad, body, m], LEAST_FRICTION) / factor)
     worlds.pos[k] = wp.vec3(wp.float32(place[0]), wp.float32(place[1]), wp.float32(place[2]))
     worlds.frame[k] = axes
     worlds.friction[k] = friction
@@ -353,14 +351,6 @@ def write_rows(worlds: Worlds, steps: Steps, slots: Slots, own: Own):
 
 
 @wp.func
-def is_among(geoms: wp.array(dtype=wp.int32), geom: wp.int32) -> wp.int32:
-    """Entry of a geom; 0 of −1, which is a flex."""
-    if geom < 0:
-        return 0
-    return geoms[geom]
-
-
-@wp.func
 def row_times(worlds: Worlds, i: wp.int32, row: wp.int32, values: wp.array2d(dtype=wp.float32)) -> wp.float64:
     """A row of the constraint's Jacobian times a vector of the degrees of freedom."""
     result = wp.float64(0.0)
@@ -372,33 +362,6 @@ def row_times(worlds: Worlds, i: wp.int32, row: wp.int32, values: wp.array2d(dty
         for k in range(worlds.nv):
             result += wp.float64(worlds.J[i, row, k]) * wp.float64(values[i, k])
     return result
-
-
-@wp.func
-def is_box(boxes: wp.array(dtype=wp.vec3), geom: wp.int32) -> wp.bool:
-    """False of −1, which is a flex."""
-    if geom < 0:
-        return False
-    return boxes[geom][0] > wp.float32(0.0)
-
-
-@wp.func
-def beside_box(worlds: Worlds, i: wp.int32, geom: wp.int32, half: wp.vec3, point: wp.vec3) -> wp.float32:
-    """Distance [m] of a point from a box, along the axis on which it is farthest out; 0 inside."""
-    local = wp.transpose(worlds.geom_xmat[i, geom]) * (point - worlds.geom_xpos[i, geom])
-    out = wp.max(wp.abs(local[0]) - half[0], wp.abs(local[1]) - half[1])
-    return wp.max(out, wp.max(wp.abs(local[2]) - half[2], wp.float32(0.0)))
-
-
-@wp.func
-def passes(
-    worlds: Worlds, i: wp.int32, geom: wp.vec2i, boxes: wp.array(dtype=wp.vec3), near: wp.vec3, far: wp.vec3, moved: wp.vec3
-) -> wp.bool:
-    """As of ``c_kernels``."""
-    one, two = boxes[geom[0]], boxes[geom[1]]
-    off = wp.max(beside_box(worlds, i, geom[0], one, near), beside_box(worlds, i, geom[1], two, far))
-    by = wp.min(beside_box(worlds, i, geom[0], one, far + moved), beside_box(worlds, i, geom[1], two, near - moved))
-    return wp.max(off, by) > _BESIDE
 
 
 @wp.kernel
@@ -417,24 +380,21 @@ def write_hard_references(
         return
     i = worlds.worldid[k]
     step, gap = timestep[i % timestep.shape[0]], worlds.dist[k]
-    # A gap is closed by the step exactly, and a penetration is taken back slowly.
-    wanted = wp.where(gap > wp.float32(0.0), gap, _BACK * gap) / step
-    open = wp.bool(False)
+    open, passed = wp.bool(False), wp.bool(False)
     ahead = wp.vec3()
     if gap > wp.float32(0.0):
         for m in range(3):
             other = worlds.efc_address[k, m]
             if other >= 0:
                 ahead[m] = worlds.vel[i, other] + step * wp.float32(row_times(worlds, i, other, worlds.qacc_smooth))
-        open = gap > _OPEN and gap + step * ahead[0] > _OPEN
         if is_box(boxes, geom[0]) and is_box(boxes, geom[1]):
-            frame = worlds.frame[k]
-            shift = wp.float32(0.5) * gap * frame[0]
-            until = wp.min(step, gap / wp.max(-ahead[0], _SLOWEST))
-            moved = wp.transpose(frame) * wp.vec3(-gap, until * ahead[1], until * ahead[2])
-            if passes(worlds, i, geom, boxes, worlds.pos[k] - shift, worlds.pos[k] + shift, moved):
-                wanted, open = _FAR / step, wp.bool(True)
-    worlds.aref[i, row] = -(worlds.vel[i, row] + wanted) / step
+            passed = passes(
+                worlds.geom_xmat[i, geom[0]], worlds.geom_xpos[i, geom[0]], boxes[geom[0]],
+                worlds.geom_xmat[i, geom[1]], worlds.geom_xpos[i, geom[1]], boxes[geom[1]],
+                worlds.pos[k], worlds.frame[k], gap, ahead, wp.min(step, gap / wp.max(-ahead[0], _SLOWEST)),
+            )  # fmt: skip
+        open = passed or is_open(gap, ahead[0], step)
+    worlds.aref[i, row] = -(worlds.vel[i, row] + closing(gap, passed) / step) / step
     for m in range(1, 3):
         other = worlds.efc_address[k, m]
         if other >= 0:
@@ -458,8 +418,7 @@ def begin_correction(worlds: Worlds, steps: Steps, own: Own):
 def correct_lifts(worlds: Worlds, own: Own, steps: Steps, slots: Slots):
     """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step.
 
-    A slide that is faster by a lift that is larger asks for more: the first guess follows from the contact's own mass, the others by
-    secants. ``steps.slides`` stays 1 until the lift fits.
+    ``steps.slides`` stays 1 until all fit.
     """
     i, pad, body = wp.tid()
     k = own.contact[i, pad, body]
@@ -468,31 +427,17 @@ def correct_lifts(worlds: Worlds, own: Own, steps: Steps, slots: Slots):
     row = worlds.efc_address[k, 0]
     if row < 0 or worlds.efc_address[k, _ROWS - 1] < 0:
         return
-    step, t, lift = steps.length[i], own.scale[i, pad, body], slots.lift[i, pad, body]
-    regular, sheared = slots.regularisation[i, pad, body, 0], slots.regularisation[i, pad, body, 1]
-    friction, ratio = wp.max(slots.friction[i, pad, body, 0], _LEAST), sheared / regular
+    step, t, total = steps.length[i], own.scale[i, pad, body], wp.float64(0.0)
     ahead = wp.float64(worlds.vel[i, row]) + step * row_times(worlds, i, row, worlds.qacc)
-    normal = wp.max(slots.force[i, pad, body, 0] + lift - ahead / (regular * step), _0)
-    total = wp.float64(0.0)
     for m in range(1, _ROWS):
         other, factor = worlds.efc_address[k, m] + 0, wp.where(is_scaled(m), t, _1)
-        ahead = (wp.float64(worlds.vel[i, other]) + step * row_times(worlds, i, other, worlds.qacc)) / factor
-        part = slots.force[i, pad, body, m] - ahead / (slots.regularisation[i, pad, body, m] * step)
-        part *= friction / wp.max(slots.friction[i, pad, body, m - 1], _LEAST)
-        total += part * part
-    lacks = friction * ratio * wp.max(wp.sqrt(total) - friction * normal, _0) - lift
-    if wp.abs(lacks) > _FITS * normal:
+        slide = (wp.float64(worlds.vel[i, other]) + step * row_times(worlds, i, other, worlds.qacc)) / factor
+        force = slide_force(slots, i, pad, body, m, slide, step)
+        total += force * force
+    lacks, less = correct_lift(slots, i, pad, body, ahead, wp.sqrt(total), step)
+    if lacks:
         wp.atomic_max(steps.slides, i, 1)
-        tried = slots.tried[i, pad, body]
-        square = friction * friction * ratio
-        more = lacks * (_1 + square * slots.compliance[i, pad, body] / sheared / (_1 + square))
-        if not wp.isnan(tried[0]) and tried[1] != lacks:
-            more = lacks * (lift - tried[0]) / (tried[1] - lacks)
-        more = wp.max(more, -lift)
-        slots.tried[i, pad, body] = wp.vec2d(lift, lacks)
-        slots.lift[i, pad, body] = lift + more
-        slots.force[i, pad, body, 0] = slots.force[i, pad, body, 0] - more
-        worlds.aref[i, row] = wp.float32(wp.float64(worlds.aref[i, row]) - more * regular)
+        worlds.aref[i, row] = wp.float32(wp.float64(worlds.aref[i, row]) - less)
 
 
 @wp.kernel
