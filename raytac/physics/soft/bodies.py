@@ -63,7 +63,7 @@ class SceneBody:
 def pad_body(mesh: PadMesh, gelpad: GelpadSpec, name: str = PAD) -> ipc.SoftBody:
     """The gel of a pad: stable neo-Hookean, fixed where bonded, with self-contact."""
     material = ipc.Material(young=gelpad.youngs_modulus, poisson=gelpad.poisson_ratio, density=gelpad.density)
-    return ipc.SoftBody(name, mesh.tets, material, bonded=mesh.bonded, self_contact=True)
+    return ipc.SoftBody(name, mesh.tets, material, bonded=mesh.bonded, self_contact=True, volume_blocks=mesh.volume_blocks)
 
 
 def scene_body(

@@ -25,6 +25,8 @@ class PadLevel:
     """Height of the lowest layer over that of the uppermost."""
     d_hat: float
     """Distance below which object and coat repel [m]."""
+    block: tuple[int, int, int] | None = None
+    """Cells along x, y and z that share their change of volume; None: each tetrahedron has its own."""
 
 
 PAD_LEVELS = {
@@ -47,6 +49,8 @@ class PadMesh:
     """Numbers of the vertices of ``tets`` that are fixed to the case."""
     d_hat: float
     """Distance below which object and coat repel [m]."""
+    volume_blocks: np.ndarray | None = None
+    """Volume block of each tetrahedron, shape (T,), as of ``ipc.SoftBody``; None: no blocks."""
 
     def __post_init__(self) -> None:
         if len(self.bonded) == 0:
@@ -85,7 +89,8 @@ def pad_mesh(gelpad: GelpadSpec, level: str | PadLevel | PadMesh) -> PadMesh:
     at_side = (np.abs(vertices[:, :2]) >= 0.5 * np.asarray(gelpad.size) * (1.0 - 1e-12)).any(axis=1)
     bonded = np.flatnonzero(at_back | at_side if gelpad.bonded == "back_and_sides" else at_back)
     coat = CoatMesh(vertices[coat_vertices], _coat_faces(tets.tets, coat_vertices[0], vertices), x, y)
-    return PadMesh(ipc.TetMesh(vertices, tets.tets), coat, coat_vertices, bonded, level.d_hat)
+    blocks = level.block and ipc.grid_blocks((len(x) - 1, len(y) - 1, level.layers), level.block)
+    return PadMesh(ipc.TetMesh(vertices, tets.tets), coat, coat_vertices, bonded, level.d_hat, blocks)
 
 
 def _lines(size: float, level: PadLevel) -> np.ndarray:

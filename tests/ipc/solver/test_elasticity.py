@@ -82,10 +82,10 @@ def test_projected_hessian_is_definite_and_close(model: Model, rng: np.random.Ge
         y = (solver.layout.node_rest + scale * rng.standard_normal(solver.layout.node_rest.shape)) * [1, 1, height]
         gradient_at(solver, y)
         solver.fill_matrix(solver.everyone)
-        exact, c = dense(solver), solver.el_mck.numpy()[0, :, 1].copy()
+        exact, c = dense(solver), solver.el_mckl.numpy()[0, :, 1].copy()
         gradient_at(solver, y, project=True)
         solver.fill_matrix(solver.everyone)
-        projected, reduced = dense(solver), solver.el_mck.numpy()[0, :, 1].copy()
+        projected, reduced = dense(solver), solver.el_mckl.numpy()[0, :, 1].copy()
         top = np.linalg.eigvalsh(projected)[-1]
         assert np.linalg.eigvalsh(projected)[0] > -1e-12 * top
         indefinite += np.linalg.eigvalsh(exact)[0] < -1e-9 * top
