@@ -107,9 +107,7 @@ def strain_energy(F: wp.mat33d, mean: wp.float64, model: wp.int32, mu: wp.float6
 
 
 @wp.func
-def stress_factors(
-    F: wp.mat33d, J: wp.float64, mean: wp.float64, model: wp.int32, mu: wp.float64, lam: wp.float64
-) -> wp.vec3d:
+def stress_factors(F: wp.mat33d, J: wp.float64, mean: wp.float64, model: wp.int32, mu: wp.float64, lam: wp.float64) -> wp.vec3d:
     """(m, c, k) of the module's docstring [Pa]."""
     one = wp.float64(1.0)
     pressure = lam * (mean - one + squeeze_first(J))

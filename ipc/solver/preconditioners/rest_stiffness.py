@@ -10,6 +10,8 @@ its nodes by q_i q_jᵀ with q = √(λ/V_b) Σ V_e ∇w (``ipc/solver/dilation.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,8 +47,8 @@ def couplings(layout: Layout) -> tuple[Ints, Ints]:
 
 def _block_pairs(layout: Layout) -> tuple[Ints, Ints]:
     """Every two entries of ``layout.pair_node`` that belong to one volume block."""
-    starts = layout.block_pair_start
-    meshed = [np.meshgrid(np.arange(a, b), np.arange(a, b), indexing="ij") for a, b in zip(starts[:-1], starts[1:], strict=True)]
+    spans = [np.arange(a, b) for a, b in pairwise(layout.block_pair_start)]
+    meshed = [np.meshgrid(span, span, indexing="ij") for span in spans]
     return np.concatenate([m[0].ravel() for m in meshed]), np.concatenate([m[1].ravel() for m in meshed])
 
 

@@ -18,9 +18,12 @@ Model = Literal["stable", "stable_log"]
 MODELS: list[Model] = ["stable", "stable_log"]
 
 
-def make_potential(material: ipc.Material, mesh: ipc.TetMesh | None = None, bonded: np.ndarray | None = None) -> Potential:
+def make_potential(
+    material: ipc.Material, mesh: ipc.TetMesh | None = None, bonded: np.ndarray | None = None, blocks: np.ndarray | None = None
+) -> Potential:
     """A solver of one cube of soft material, statics only."""
-    body = ipc.SoftBody("cube", mesh or unit_cell(1), material, bonded=np.zeros(0, int) if bonded is None else bonded)
+    held = np.zeros(0, int) if bonded is None else bonded
+    body = ipc.SoftBody("cube", mesh or unit_cell(1), material, bonded=held, volume_blocks=blocks)
     layout = build_layout([body], 0.0, {}, [])
     statics = ipc.Settings(dt=np.inf)  # no inertia
     solver = Potential(layout, statics, 1, 0.01, 1.0, wp.get_device("cpu"))
@@ -31,12 +34,22 @@ def make_potential(material: ipc.Material, mesh: ipc.TetMesh | None = None, bond
 
 
 def dense(solver: Potential) -> np.ndarray:
-    """The assembled block matrix as a dense one, (3N, 3N)."""
+    """The assembled matrix, with the rows of volume blocks, as a dense one (3N, 3N)."""
     n, layout = solver.y.shape[1], solver.layout
     out = np.zeros((n, n, 3, 3))
     rows = np.repeat(np.arange(n), np.diff(layout.row_start))
     out[rows, layout.col] = solver.system.blocks.numpy()[0, solver.where]
+    q = volume_rows(solver)
+    out += np.einsum("bia,bjc->ijac", q, q)
     return out.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
+
+
+def volume_rows(solver: Potential) -> np.ndarray:
+    """q of every volume block at every node, (Q, N, 3)."""
+    layout = solver.layout
+    q = np.zeros((len(layout.block_volume), solver.y.shape[1], 3))
+    q[layout.pair_block, layout.pair_node] = solver.system.volume_row.numpy()[0]
+    return q
 
 
 def gradient_at(solver: Potential, y: np.ndarray, project: bool = False) -> np.ndarray:

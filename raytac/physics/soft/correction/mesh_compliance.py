@@ -62,9 +62,9 @@ class _Sparse:
 def rest_stiffness(mesh: PadMesh, gelpad: GelpadSpec) -> _Sparse:
     """Stiffness of all vertices [N/m], (3n, 3n), unknown 3 v + axis, by linear elasticity.
 
-    A tetrahedron of volume V whose shape functions have gradients g adds V (λ g_a g_bᵀ + μ g_b g_aᵀ + μ (g_a · g_b) 1) to block (a, b). In a
-    volume block λ, of the solver's energy λ + μ, belongs to the mean dilation: it adds (λ + μ)/V_b q q ᵀ with q = Σ V g, and a tetrahedron
-    keeps V (−μ g_a g_bᵀ + …) (``ipc.solver.dilation``).
+    A tetrahedron of volume V whose shape functions have gradients g adds V (λ g_a g_bᵀ + μ g_b g_aᵀ + μ (g_a · g_b) 1) to block (a, b).
+    In a volume block b its λ is −μ, and the block adds (λ + μ)/V_b q qᵀ with q = Σ V g: the coefficient of (J − 1)² in the solver's energy
+    is λ + μ, and all of it belongs to the block (``ipc.solver.dilation``).
     """
     vertices, tets = mesh.tets.vertices, mesh.tets.tets
     young, nu = gelpad.youngs_modulus, gelpad.poisson_ratio
