@@ -42,9 +42,9 @@ class Layout:
         node_drive: strength s of the drive (N,).    node_aim: its frame, −1 without (N,).    aim_local: position there [m] (N, 3).
         tets: nodes (T, 4).    grads: ∇w of each corner [1/m] (T, 4, 3).    volume: [m³] (T,).
         model, mu, lam: energy code and coefficients [Pa] (T,).
-        volume_block: number of the volume block that an element belongs to, −1 for none (T,).
-        block_tet_start (Q+1,), block_tet: elements of each of Q volume blocks.    block_volume [m³], block_lam [Pa], block_rest: V_b, λ and
-            a of ``ipc.solver.dilation`` (Q,).
+        volume_block: number of the volume block that an element belongs to, −1 for none (T,).    own: λ' of elements [Pa] (T,).
+        block_tet_start (Q+1,), block_tet: elements of each of Q volume blocks.    block_volume [m³], block_lam [Pa], block_rest (Q,): V_b,
+            λ − λ' and a of ``ipc.solver.dilation``.
         pair_block, pair_node (S,): pairs of a volume block and a node of it, by block.    block_pair_start (Q+1,): first of each block.
             pair_corner_start (S+1,), pair_corner: 4·element + a for each element of the block at the node.
         node_pair_start (N+1,), node_pair: the pairs that a node is in.
@@ -88,6 +88,7 @@ class Layout:
     mu: Floats
     lam: Floats
     volume_block: Ints
+    own: Floats
     block_tet_start: Ints
     block_tet: Ints
     block_volume: Floats
@@ -126,7 +127,7 @@ class Layout:
     max_young: float
 
 
-_NUMBERS = ("node_rest", "node_damping", "node_drive", "aim_local", "grads", "volume", "mu", "lam")
+_NUMBERS = ("node_rest", "node_damping", "node_drive", "aim_local", "grads", "volume", "mu", "lam", "own")
 """Fields of :class:`Layout` that are those of the bodies, one after the other."""
 
 
@@ -187,6 +188,7 @@ def _soft(body: SoftBody) -> tuple[TriMesh, Arrays]:
     free = np.ones(len(x))
     free[np.concatenate([body.bonded, *body.grips.values()])] = 0
     mu, lam = body.material.coefficients()
+    blocks = np.full(len(tets), -1) if body.volume_blocks is None else body.volume_blocks
     used, local = np.unique(surface_of(tets), return_inverse=True)
     return TriMesh(x[used], local.reshape(-1, 3)), {
         "node_rest": placed,
@@ -200,7 +202,8 @@ def _soft(body: SoftBody) -> tuple[TriMesh, Arrays]:
         "model": np.full(len(tets), MODEL_CODES[body.material.model]),
         "mu": np.full(len(tets), mu),
         "lam": np.full(len(tets), lam),
-        "volume_block": np.full(len(tets), -1) if body.volume_blocks is None else body.volume_blocks,
+        "volume_block": blocks,
+        "own": np.where(blocks < 0, lam, body.own_volume * mu),
         "mass_row": np.arange(len(x)),
         "mass_col": np.arange(len(x)),
         "mass": lumped,
@@ -227,6 +230,7 @@ def _affine(body: AffineBody) -> tuple[TriMesh, Arrays]:
         "mu": np.array([body.material.stiffness]),
         "lam": np.zeros(1),
         "volume_block": np.full(1, -1),
+        "own": np.zeros(1),
         "mass_row": row.ravel(),
         "mass_col": col.ravel(),
         "mass": mass.ravel(),
@@ -423,7 +427,7 @@ def build_layout(
         tets=tets,
         model=_ints(joined("model")),
         block_volume=_floats(np.bincount(block_of, weights, minlength=len(first))),
-        block_lam=_floats(block_lam),
+        block_lam=_floats(block_lam - joined("own")[first]),
         block_rest=_floats(np.where(log, 1.0 + 0.75 * block_mu / block_lam, 1.0)),
         row_start=_starts(np.bincount(blocks // n, minlength=n)),
         col=_ints(blocks % n),

@@ -6,15 +6,19 @@ lock. A block b of tetrahedra e with volumes V_e has one condition for all of th
     J̄ = Σ V_e det F_e / V_b,      V_b = Σ V_e,
 
 the term λ/2 (J − a)² of the stored energies (``ipc/solver/elasticity.py``; a = 1 for ``stable``, 1 + 3μ/(4λ) for ``stable_log``) becomes
-V_b λ/2 (J̄ − a)², and everything else stays with the tetrahedra. The sum of −μ (J − 1) is −μ V_b (J̄ − 1) as it stands, so the block's is
-the whole volumetric function of ``stable``. This is the mean dilation of Nagtegaal, Parks and Rice (Comput. Methods Appl. Mech. Eng. 4,
-1974) and B-bar of Hughes (Int. J. Numer. Methods Eng. 15, 1980), for groups of tetrahedra as in the F-bar-patch of de Souza Neto, Andrade
-Pires and Owen (Int. J. Numer. Methods Eng. 62, 2005); it is the three-field form with pressure and dilation constant in a block (Simo,
-Taylor, Pister, Comput. Methods Appl. Mech. Eng. 51, 1985). The barrier against inversion stays with each tetrahedron.
+V_b (λ − λ')/2 (J̄ − a)² and λ'/2 (J − a)² of each tetrahedron, and everything else stays with the tetrahedra. The sum of −μ (J − 1) is −μ
+V_b (J̄ − 1) as it stands, so with λ' = 0 the block's is the whole volumetric function of ``stable``. This is the mean dilation of
+Nagtegaal, Parks and Rice (Comput. Methods Appl. Mech. Eng. 4, 1974) and B-bar of Hughes (Int. J. Numer. Methods Eng. 15, 1980), for
+groups of tetrahedra as in the F-bar-patch of de Souza Neto, Andrade Pires and Owen (Int. J. Numer. Methods Eng. 62, 2005); it is the
+three-field form with pressure and dilation constant in a block (Simo, Taylor, Pister, Comput. Methods Appl. Mech. Eng. 51, 1985). The
+barrier against inversion stays with each tetrahedron.
+
+With λ' = 0 a free surface is on the verge of wrinkling (what is left inside a block is the linear material with λ = −μ, whose short
+surface waves have no stiffness), and Newton's method takes many iterations. λ' of a fraction of μ prevents it and costs little accuracy.
 
 Forces are those of elements whose J is J̄ in the volumetric factor c. The second derivative has, besides the elements' own,
 
-    U''(J̄)/V_b (Σ V_e ∂J_e) (Σ V_e ∂J_e)ᵀ = q qᵀ,      q = √(λ/V_b) Σ V_e cof F_e ∇w,
+    (λ − λ')/V_b (Σ V_e ∂J_e) (Σ V_e ∂J_e)ᵀ = q qᵀ,      q = √((λ − λ')/V_b) Σ V_e cof F_e ∇w,
 
 which is positive semi-definite. q is kept by the nodes of a block and multiplied as it stands: first q·p of every block, then each node
 gathers from the blocks around it, so that sums have one order.
@@ -38,7 +42,7 @@ class VolumeBlocks:
     """Q blocks and their S pairs (block, node).
 
     ``block_tet_start`` (Q+1,), ``block_tet``: elements of each block.    ``block_volume`` (Q,): V_b [m³].
-    ``block_lam`` [Pa], ``block_rest`` (Q,): λ and a.
+    ``block_lam`` [Pa], ``block_rest`` (Q,): λ − λ' and a.
     ``pair_block``, ``pair_node`` (S,).    ``pair_corner_start`` (S+1,), ``pair_corner``: 4·element + a for each element of the block at
     the node.
     """
@@ -104,7 +108,7 @@ def block_energy_change(
     # outputs
     change: FloatArray2d,
 ):
-    """Adds V_b λ/2 (J̄ − a)² at y1, less that at y0 [J], to the first element of each block."""
+    """Adds V_b (λ − λ')/2 (J̄ − a)² at y1, less that at y0 [J], to the first element of each block."""
     env, b = wp.tid()
     if active[env] == 0:
         return

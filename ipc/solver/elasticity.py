@@ -18,8 +18,9 @@ and every term but the last is positive semi-definite. The blocks need no 9×9 m
 a and b by −c [F (g_a × g_b)]_×. Where the matrix must be positive semi-definite, ``geometric_factor`` shrinks c toward 0 until it is;
 the semi-definite set of c is an interval around 0, computed from the singular values (Smith et al. 2018, section 4, gives the modes).
 
-Elements of a volume block have its mean dilation J̄ in the place of J in λ/2 (J − 1)² or λ/2 (J − a)², and so in c; for them l is the
-barrier's curvature alone. What the mean adds to the second derivative, a term of rank one a block, is in ``ipc/solver/dilation.py``.
+Elements of a volume block keep λ' of the λ in λ/2 (J − 1)² or λ/2 (J − a)²; the rest, λ − λ', has the block's mean dilation J̄ in the place
+of J, and so in c, and l has λ' for λ. What the mean adds to the second derivative, a term of rank one a block, is in
+``ipc/solver/dilation.py``.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -40,7 +41,7 @@ wp.set_module_options({"enable_backward": False})
 class Elements:
     """Tetrahedra: nodes, ∇w of corners [1/m], volume [m³], energy code, coefficients [Pa].
 
-    ``volume_block``: number of the block that shares its mean dilation, or −1.
+    ``volume_block``: number of the block that shares its mean dilation, or −1.    ``own``: λ' [Pa], λ itself without a block.
     """
 
     tets: IntArray2d
@@ -50,6 +51,7 @@ class Elements:
     mu: FloatArray
     lam: FloatArray
     volume_block: IntArray
+    own: FloatArray
 
 
 @wp.func
@@ -90,8 +92,10 @@ def squeeze_second(det: wp.float64) -> wp.float64:
 
 
 @wp.func
-def strain_energy(F: wp.mat33d, mean: wp.float64, model: wp.int32, mu: wp.float64, lam: wp.float64) -> wp.float64:
-    """Ψ(F) [J/m³]; ``mean`` is J, or the mean dilation of the element's block."""
+def strain_energy(
+    F: wp.mat33d, mean: wp.float64, own: wp.float64, model: wp.int32, mu: wp.float64, lam: wp.float64
+) -> wp.float64:
+    """Ψ(F) [J/m³]; ``mean`` is the mean dilation of the element's block, ``own`` λ'."""
     one, half = wp.float64(1.0), wp.float64(0.5)
     ic = wp.ddot(F, F)
     J = wp.determinant(F)
@@ -100,17 +104,23 @@ def strain_energy(F: wp.mat33d, mean: wp.float64, model: wp.int32, mu: wp.float6
         return mu * wp.ddot(C, C)
     if model == 1:
         a = one + wp.float64(0.75) * mu / lam
-        base = half * mu * (ic - wp.float64(3.0)) + half * lam * (mean - a) * (mean - a) - half * mu * wp.log(ic + one)
+        base = (
+            half * mu * (ic - wp.float64(3.0))
+            + half * (own * (J - a) * (J - a) + (lam - own) * (mean - a) * (mean - a))
+            - half * mu * wp.log(ic + one)
+        )
         return base + lam * squeeze(J)
-    volumetric = half * lam * (mean - one) * (mean - one)
+    volumetric = half * (own * (J - one) * (J - one) + (lam - own) * (mean - one) * (mean - one))
     return half * mu * (ic - wp.float64(3.0)) - mu * (J - one) + volumetric + lam * squeeze(J)
 
 
 @wp.func
-def stress_factors(F: wp.mat33d, J: wp.float64, mean: wp.float64, model: wp.int32, mu: wp.float64, lam: wp.float64) -> wp.vec3d:
+def stress_factors(
+    F: wp.mat33d, J: wp.float64, mean: wp.float64, own: wp.float64, model: wp.int32, mu: wp.float64, lam: wp.float64
+) -> wp.vec3d:
     """(m, c, k) of the module's docstring [Pa]."""
     one = wp.float64(1.0)
-    pressure = lam * (mean - one + squeeze_first(J))
+    pressure = own * (J - one) + (lam - own) * (mean - one) + lam * squeeze_first(J)
     if model == 1:
         q = one / (wp.ddot(F, F) + one)
         return wp.vec3d(mu * (one - q), pressure - wp.float64(0.75) * mu, wp.float64(2.0) * mu * q * q)
@@ -172,7 +182,7 @@ def strain_energy_change(
 ) -> wp.float64:
     """Ψ(F1) − Ψ(F0) [J/m³], written in F1 − F0, so that it keeps its digits near rest.
 
-    ``own``: 1, or 0 where λ/2 (J − a)² belongs to a volume block.
+    ``own``: λ', with which the element has λ'/2 (J − a)².
     """
     one, half = wp.float64(1.0), wp.float64(0.5)
     G = F1 - F0
@@ -191,8 +201,8 @@ def strain_energy_change(
         log1p = wp.log(one + z)
         if wp.abs(z) < wp.float64(1.0e-3):
             log1p = z * (one - z * (half - z * (one / wp.float64(3.0) - z * (wp.float64(0.25) - z * wp.float64(0.2)))))
-        return half * mu * (ic - log1p) + own * half * lam * J * (both - wp.float64(2.0) * a) + barrier
-    return half * mu * ic - mu * J + own * half * lam * J * (both - wp.float64(2.0)) + barrier
+        return half * mu * (ic - log1p) + half * own * J * (both - wp.float64(2.0) * a) + barrier
+    return half * mu * ic - mu * J + half * own * J * (both - wp.float64(2.0)) + barrier
 
 
 @wp.func
@@ -221,8 +231,8 @@ def element_state(
 ):
     """F, volume·P, (m, c', k, l), J and energy [J] of every element of the active environments.
 
-    ``dilation``: J̄ of every volume block. In a block, where the second derivative is projected, l is greater by μ: without a λ of its
-    own an element would have to give up half of c even at rest, and with it the freedom to turn.
+    ``dilation``: J̄ of every volume block. In a block, where the second derivative is projected, λ' counts as μ at least in l: without a
+    λ of its own an element would have to give up half of c even at rest, and with it the freedom to turn.
     """
     env, e = wp.tid()
     if active[env] == 0:
@@ -231,15 +241,14 @@ def element_state(
     F = deformation(env, e, y, elements)
     J = wp.determinant(F)
     mean = J
-    stiff = lam * squeeze_second(J)
+    own = elements.own[e]
+    stiff = own + lam * squeeze_second(J)
     block = elements.volume_block[e]
     if block >= 0:
         mean = dilation[env, block]
         if project[env] != 0:
-            stiff += mu
-    else:
-        stiff += lam
-    f = stress_factors(F, J, mean, elements.model[e], mu, lam)
+            stiff += wp.max(mu - own, wp.float64(0.0))
+    f = stress_factors(F, J, mean, own, elements.model[e], mu, lam)
     c = f[1]
     if project[env] != 0 and elements.model[e] != 2:
         c = geometric_factor(F, f[0], f[2], stiff, c)
@@ -247,7 +256,7 @@ def element_state(
     el_P[env, e] = elements.volume[e] * first_piola(F, f, elements.model[e], mu)
     el_mckl[env, e] = wp.vec4d(f[0], c, f[2], stiff)
     el_J[env, e] = J
-    el_energy[env, e] = elements.volume[e] * strain_energy(F, mean, elements.model[e], mu, lam)
+    el_energy[env, e] = elements.volume[e] * strain_energy(F, mean, own, elements.model[e], mu, lam)
 
 
 @wp.kernel
@@ -327,17 +336,15 @@ def element_energy_change(
 ):
     """Ψ(y1) − Ψ(y0) of every element [J], J at y1, and its change; sums of differences keep digits.
 
-    The quadratic volumetric term of a volume block's elements is left to the block.
+    What belongs to a volume block is left to the block.
     """
     env, e = wp.tid()
     if active[env] == 0:
         return
     F0 = deformation(env, e, y0, elements)
     F1 = deformation(env, e, y1, elements)
-    own = wp.float64(1.0)
     if elements.volume_block[e] >= 0:
-        own = wp.float64(0.0)
         det_change[env, e] = volume_change(F0, F1)
-    psi = strain_energy_change(F0, F1, own, elements.model[e], elements.mu[e], elements.lam[e])
+    psi = strain_energy_change(F0, F1, elements.own[e], elements.model[e], elements.mu[e], elements.lam[e])
     change[env, e] = elements.volume[e] * psi
     det[env, e] = wp.determinant(F1)

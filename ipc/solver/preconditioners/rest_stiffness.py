@@ -4,8 +4,8 @@ At F = 1 the second derivative of the energies in ``ipc/solver/elasticity.py`` c
 
     V (m g_a·g_b 1 + k g_a g_bᵀ + λ g_a g_bᵀ + m [g_a × g_b]_×),      m = μ, k = 0 (stable);   m = 3μ/4, k = μ/8 (stable_log),
 
-since c = −m there (the rest state carries no stress), and K_0 = K + M/h² + damping. Elements of a volume block have no λ; the block couples
-its nodes by q_i q_jᵀ with q = √(λ/V_b) Σ V_e ∇w (``ipc/solver/dilation.py``).
+since c = −m there (the rest state carries no stress), and K_0 = K + M/h² + damping. Elements of a volume block have λ' for λ; the
+block couples its nodes by q_i q_jᵀ with q = √((λ − λ')/V_b) Σ V_e ∇w (``ipc/solver/dilation.py``).
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def _block_pairs(layout: Layout) -> tuple[Ints, Ints]:
 def rest_blocks(layout: Layout, settings: Settings) -> Floats:
     """Blocks of K_0 [N/m] between :func:`couplings` (K', 3, 3), except for affine bodies."""
     log = (layout.model == 1)[:, None, None]
-    mu, lam = layout.mu[:, None, None], np.where(layout.volume_block < 0, layout.lam, 0.0)[:, None, None]
+    mu, lam = layout.mu[:, None, None], layout.own[:, None, None]
     m, k = np.where(log, 0.75 * mu, mu), np.where(log, mu / 8, 0.0)
     g, eye = layout.grads, np.eye(3)
     dot = np.einsum("tai,tbi->tab", g, g)

@@ -11,6 +11,11 @@ from raytac.errors import InputError
 from raytac.gel.coat_mesh import CoatMesh
 from raytac.specs.sensor import GelpadSpec
 
+OWN_VOLUME = 0.25
+"""Stiffness of a tetrahedron of a volume block against a change of its own volume, in μ.
+
+Without any, a step that shears a flat face on the medium pad takes up to 100 Newton iterations (docs/soft-pad.md)."""
+
 
 @dataclass(frozen=True)
 class PadLevel:
@@ -30,7 +35,7 @@ class PadLevel:
 
 
 PAD_LEVELS = {
-    "coarse": PadLevel(1.6e-3, 3, 2.5, 2.0, 5e-5),
+    "coarse": PadLevel(1.6e-3, 3, 6.0, 3.0, 5e-5, (2, 2, 1)),
     "medium": PadLevel(0.85e-3, 5, 2.5, 2.5, 3e-5),
     "fine": PadLevel(0.5e-3, 8, 2.5, 3.0, 1.5e-5),
 }

@@ -19,11 +19,15 @@ MODELS: list[Model] = ["stable", "stable_log"]
 
 
 def make_potential(
-    material: ipc.Material, mesh: ipc.TetMesh | None = None, bonded: np.ndarray | None = None, blocks: np.ndarray | None = None
+    material: ipc.Material,
+    mesh: ipc.TetMesh | None = None,
+    bonded: np.ndarray | None = None,
+    blocks: np.ndarray | None = None,
+    own_volume: float = 0.0,
 ) -> Potential:
     """A solver of one cube of soft material, statics only."""
     held = np.zeros(0, int) if bonded is None else bonded
-    body = ipc.SoftBody("cube", mesh or unit_cell(1), material, bonded=held, volume_blocks=blocks)
+    body = ipc.SoftBody("cube", mesh or unit_cell(1), material, bonded=held, volume_blocks=blocks, own_volume=own_volume)
     layout = build_layout([body], 0.0, {}, [])
     statics = ipc.Settings(dt=np.inf)  # no inertia
     solver = Potential(layout, statics, 1, 0.01, 1.0, wp.get_device("cpu"))

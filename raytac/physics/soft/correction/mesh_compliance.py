@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 
-from raytac.physics.soft.mesh import PadMesh
+from raytac.physics.soft.mesh import OWN_VOLUME, PadMesh
 from raytac.specs.sensor import GelpadSpec
 
 _SAME_PLACE = 1e-9
@@ -63,8 +62,8 @@ def rest_stiffness(mesh: PadMesh, gelpad: GelpadSpec) -> _Sparse:
     """Stiffness of all vertices [N/m], (3n, 3n), unknown 3 v + axis, by linear elasticity.
 
     A tetrahedron of volume V whose shape functions have gradients g adds V (λ g_a g_bᵀ + μ g_b g_aᵀ + μ (g_a · g_b) 1) to block (a, b).
-    In a volume block b its λ is −μ, and the block adds (λ + μ)/V_b q qᵀ with q = Σ V g: the coefficient of (J − 1)² in the solver's energy
-    is λ + μ, and all of it belongs to the block (``ipc.solver.dilation``).
+    In a volume block b its λ is λ' − μ, and the block adds (λ + μ − λ')/V_b q qᵀ with q = Σ V g: the coefficient of (J − 1)² in the
+    solver's energy is λ + μ, of which the tetrahedron keeps λ' = ``OWN_VOLUME`` μ (``ipc.solver.dilation``).
     """
     vertices, tets = mesh.tets.vertices, mesh.tets.tets
     young, nu = gelpad.youngs_modulus, gelpad.poisson_ratio
@@ -77,7 +76,7 @@ def rest_stiffness(mesh: PadMesh, gelpad: GelpadSpec) -> _Sparse:
     volume = np.abs(np.linalg.det(edges)) / 6.0
     own = np.full(len(tets), lame)
     if mesh.volume_blocks is not None:
-        own[mesh.volume_blocks >= 0] = -shear
+        own[mesh.volume_blocks >= 0] = (OWN_VOLUME - 1.0) * shear
     block = own[:, None, None, None, None] * outer + shear * np.swapaxes(outer, 3, 4)
     block += shear * np.einsum("tac,tbc->tab", slope, slope)[..., None, None] * np.eye(3)
     block *= volume[:, None, None, None, None]
@@ -87,25 +86,25 @@ def rest_stiffness(mesh: PadMesh, gelpad: GelpadSpec) -> _Sparse:
     row, column = 3 * (pair // n)[:, None, None] + np.arange(3)[:, None], 3 * (pair % n)[:, None, None] + np.arange(3)
     row, column = (np.broadcast_to(x, (len(pair), 3, 3)).ravel() for x in (row, column))
     value = np.bincount(entry, block.ravel(), 9 * len(pair))
-    for inside, weight in _volume_blocks(mesh, volume):
+    rows, columns, values = [row], [column], [value]
+    for inside in _volume_blocks(mesh):
         unknown, where = np.unique(3 * tets[inside][:, :, None] + np.arange(3), return_inverse=True)
-        total = np.bincount(where.ravel(), (weight[:, None, None] * slope[inside]).ravel())
-        bulk = (lame + shear) / weight.sum() * total[:, None] * total
-        row = np.concatenate([row, np.repeat(unknown, len(unknown))])
-        column, value = np.concatenate([column, np.tile(unknown, len(unknown))]), np.concatenate([value, bulk.ravel()])
+        total = np.bincount(where.ravel(), (volume[inside, None, None] * slope[inside]).ravel())
+        rows.append(np.repeat(unknown, len(unknown)))
+        columns.append(np.tile(unknown, len(unknown)))
+        values.append(((lame + shear - OWN_VOLUME * shear) / volume[inside].sum() * total[:, None] * total).ravel())
+    row, column, value = (np.concatenate(parts) for parts in (rows, columns, values))
     order = np.argsort(row * 3 * n + column, kind="stable")
     return _Sparse(row[order], column[order], value[order], (3 * n, 3 * n))
 
 
-def _volume_blocks(mesh: PadMesh, volume: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Tetrahedra of each volume block, and their volumes."""
+def _volume_blocks(mesh: PadMesh) -> list[np.ndarray]:
+    """Tetrahedra of each volume block."""
     if mesh.volume_blocks is None:
-        return
+        return []
     order = np.argsort(mesh.volume_blocks, kind="stable")
-    starts = np.flatnonzero(np.diff(mesh.volume_blocks[order])) + 1
-    for inside in np.split(order, starts):
-        if mesh.volume_blocks[inside[0]] >= 0:
-            yield inside, volume[inside]
+    blocks = np.split(order, np.flatnonzero(np.diff(mesh.volume_blocks[order])) + 1)
+    return [block for block in blocks if mesh.volume_blocks[block[0]] >= 0]
 
 
 def _layers(mesh: PadMesh) -> np.ndarray:
