@@ -17,7 +17,8 @@ A ball (3.155 mm, the scene "sphere") is pressed 0.8 mm into the GelSight Mini's
   one of 1.5 mm 0.3 mm deep, on the pad without its dome and without friction, at a place (0.13, 0.09) mm off the middle that is on no
   symmetry of a mesh. The stand-off is taken out: the tool is lower by the mean gap, weighted by force, than the depth. Beside them what
   they cost: ``soft.<level>.solver_ms`` (a step of 0.1 mm, ball; processor time, on CUDA wall time), ``….newton`` and ``….pcg`` a step, and
-  ``….least_det_f`` over the three. ``--forces`` leaves everything else out.
+  ``….least_det_f`` over the three. ``--forces`` leaves everything else out. ``--study`` adds ``soft.study.<name>.*`` of other gradings and
+  volume blocks, and of the coarse level at four other places.
 - ``force.driven_error``, ``force.weight_error``: force on the case (bonded vertices) when 1 N is asked for; force on the coat under a free
   object of 0.3 N.
 """
@@ -40,6 +41,7 @@ from raytac.io import CommonOptions, Metric, parse_names
 from raytac.physics import Ipc, PadLevel, SoftPad, pad_mesh
 from raytac.physics.objects import object_parts
 from raytac.physics.soft.bodies import pad_body
+from raytac.physics.soft.mesh import PAD_LEVELS
 from raytac.sensor import TactileSensor
 from raytac.shapes.triangulate import object_surface
 from raytac.specs import PADS, GelpadSpec, ObjectSpec, PressScene, SensorSpec, StageSpec, load_press, load_sensor
@@ -59,6 +61,20 @@ TOOLS = {
 """Tools of the force errors and their depths [m]."""
 OFF_CENTRE = 0.13e-3, 0.09e-3
 STEP = 1e-4
+COARSE, MEDIUM = PAD_LEVELS["coarse"], PAD_LEVELS["medium"]
+STUDY = {
+    "coarse_2.5_plain": replace(COARSE, spread=2.5, layer_spread=2.0, block=None),
+    "coarse_6_plain": replace(COARSE, block=None),
+    "coarse_2.5_blocks": replace(COARSE, spread=2.5, layer_spread=2.0),
+    "coarse_4_blocks": replace(COARSE, spread=4.0, layer_spread=2.5),
+    "coarse_6_blocks_0": replace(COARSE, own_volume=0.0),
+    "coarse_6_blocks_0.5": replace(COARSE, own_volume=0.5),
+    "coarse_6_blocks_1": replace(COARSE, own_volume=1.0),
+    "medium_blocks_0": replace(MEDIUM, block=(2, 2, 1), own_volume=0.0),
+    "medium_blocks_1": replace(MEDIUM, block=(2, 2, 1), own_volume=1.0),
+}
+"""Gradings, blocks and λ'/μ beside those of the levels."""
+PLACES = (-0.31e-3, 0.22e-3), (0.6e-3, -0.4e-3), (2.1e-3, 1.3e-3), (4.13e-3, 3.09e-3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +89,8 @@ class Args(CommonOptions):
     """Compute the refined solution."""
     forces: bool = False
     """Measure the force errors of the levels against the fine one, and nothing else."""
+    study: bool = False
+    """Measure the same for other gradings and volume blocks than the levels have."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
 
@@ -83,7 +101,11 @@ class Args(CommonOptions):
                 raise InputError("levels", value=level, rule="must be a known level", choices=PADS)
         with recorded(self, "bench_soft", owned=("metrics.json",), packages=("warp-lang",)) as (_, metrics):
             spec = load_sensor(self.sensor)
-            metrics |= force_errors(spec.gelpad, levels, resolve_device(self.device, ray_tracing=False))
+            device = resolve_device(self.device, ray_tracing=False)
+            metrics |= force_errors(spec.gelpad, levels, device)
+            if self.study:
+                fine = {tool: float(metrics[f"soft.fine.force_n.{tool}"]) for tool in TOOLS}
+                metrics |= studied(spec.gelpad, fine, device)
             if not self.forces:
                 metrics |= measured(spec, levels, self.refined, self.presses, self.device, self.seed)
         for key, value in metrics.items():
@@ -181,7 +203,25 @@ def force_errors(gelpad: GelpadSpec, levels: tuple[str, ...], device: str) -> di
     return found
 
 
-def pressed(gelpad: GelpadSpec, level: str | PadLevel, tool: str, device: str) -> tuple[float, dict[str, float]]:
+def studied(gelpad: GelpadSpec, fine: dict[str, float], device: str) -> dict[str, Metric]:
+    """Force errors and costs of ``STUDY``, and of the coarse level at ``PLACES``."""
+    flat = replace(gelpad, dome_radius=(math.inf, math.inf))
+    runs = [(name, level, OFF_CENTRE) for name, level in STUDY.items()]
+    runs += [(f"coarse_at_{1e3 * x:.2f}_{1e3 * y:.2f}", COARSE, (x, y)) for x, y in PLACES]
+    runs += [(f"plain_at_{1e3 * x:.2f}_{1e3 * y:.2f}", STUDY["coarse_2.5_plain"], (x, y)) for x, y in PLACES]
+    found: dict[str, Metric] = {}
+    for name, level, place in runs:
+        for tool in TOOLS:
+            force, cost = pressed(flat, level, tool, device, place)
+            found[f"soft.study.{name}.force_error.{tool}"] = force / fine[tool] - 1.0
+            found |= {f"soft.study.{name}.{tool}.{key}": value for key, value in cost.items()}
+        print(f"study: {name}", flush=True)
+    return found
+
+
+def pressed(
+    gelpad: GelpadSpec, level: str | PadLevel, tool: str, device: str, place: tuple[float, float] = OFF_CENTRE
+) -> tuple[float, dict[str, float]]:
     """Normal force of a tool [N] at its depth without the stand-off, and what its steps cost."""
     thing, depth = TOOLS[tool]
     mesh = pad_mesh(gelpad, level)
@@ -189,12 +229,12 @@ def pressed(gelpad: GelpadSpec, level: str | PadLevel, tool: str, device: str) -
     vertices = surface.vertices @ ipc.rotation_matrix(thing.quaternion).T
     vertices[:, 2] -= vertices[:, 2].min()
     start = 1.2 * mesh.d_hat
-    body = ipc.KinematicBody("tool", ipc.TriMesh(vertices, surface.faces), ipc.Pose((*OFF_CENTRE, start)))
+    body = ipc.KinematicBody("tool", ipc.TriMesh(vertices, surface.faces), ipc.Pose((*place, start)))
     settings = ipc.Settings(d_hat=mesh.d_hat, velocity_tolerance=5e-5)
     world = ipc.World([pad_body(mesh, gelpad), body], settings, device=device)
 
     def step(height: float) -> ipc.StepReport:
-        world.set_target("tool", (*OFF_CENTRE, height))
+        world.set_target("tool", (*place, height))
         report = world.step()
         if not report.converged[0]:
             raise ArithmeticError(f"{level}: the {tool} at {height} m did not converge")

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 import ipc
 from raytac.errors import InputError
 from raytac.io.cache import cache_folder
-from raytac.physics.soft.mesh import OWN_VOLUME, PadMesh
+from raytac.physics.soft.mesh import PadMesh
 from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
 from raytac.physics.soft.skin import SoftSkin
 from raytac.se3 import rigid_poses
@@ -63,9 +63,8 @@ class SceneBody:
 def pad_body(mesh: PadMesh, gelpad: GelpadSpec, name: str = PAD) -> ipc.SoftBody:
     """The gel of a pad: stable neo-Hookean, fixed where bonded, with self-contact."""
     material = ipc.Material(young=gelpad.youngs_modulus, poisson=gelpad.poisson_ratio, density=gelpad.density)
-    return ipc.SoftBody(
-        name, mesh.tets, material, bonded=mesh.bonded, self_contact=True, volume_blocks=mesh.volume_blocks, own_volume=OWN_VOLUME
-    )
+    blocks = {} if mesh.volume_blocks is None else {"volume_blocks": mesh.volume_blocks, "own_volume": mesh.own_volume}
+    return ipc.SoftBody(name, mesh.tets, material, bonded=mesh.bonded, self_contact=True, **blocks)
 
 
 def scene_body(

@@ -11,11 +11,6 @@ from raytac.errors import InputError
 from raytac.gel.coat_mesh import CoatMesh
 from raytac.specs.sensor import GelpadSpec
 
-OWN_VOLUME = 0.25
-"""Stiffness of a tetrahedron of a volume block against a change of its own volume, in μ.
-
-Without any, a step that shears a flat face on the medium pad takes up to 100 Newton iterations (docs/soft-pad.md)."""
-
 
 @dataclass(frozen=True)
 class PadLevel:
@@ -32,6 +27,8 @@ class PadLevel:
     """Distance below which object and coat repel [m]."""
     block: tuple[int, int, int] | None = None
     """Cells along x, y and z that share their change of volume; None: each tetrahedron has its own."""
+    own_volume: float = 0.25
+    """Stiffness of a tetrahedron of a block against a change of its own volume, in μ; steadies the solver."""
 
 
 PAD_LEVELS = {
@@ -56,6 +53,8 @@ class PadMesh:
     """Distance below which object and coat repel [m]."""
     volume_blocks: np.ndarray | None = None
     """Volume block of each tetrahedron, shape (T,), as of ``ipc.SoftBody``; None: no blocks."""
+    own_volume: float = 0.25
+    """As of ``ipc.SoftBody``; without blocks it has no effect."""
 
     def __post_init__(self) -> None:
         if len(self.bonded) == 0:
@@ -95,7 +94,7 @@ def pad_mesh(gelpad: GelpadSpec, level: str | PadLevel | PadMesh) -> PadMesh:
     bonded = np.flatnonzero(at_back | at_side if gelpad.bonded == "back_and_sides" else at_back)
     coat = CoatMesh(vertices[coat_vertices], _coat_faces(tets.tets, coat_vertices[0], vertices), x, y)
     blocks = level.block and ipc.grid_blocks((len(x) - 1, len(y) - 1, level.layers), level.block)
-    return PadMesh(ipc.TetMesh(vertices, tets.tets), coat, coat_vertices, bonded, level.d_hat, blocks)
+    return PadMesh(ipc.TetMesh(vertices, tets.tets), coat, coat_vertices, bonded, level.d_hat, blocks, level.own_volume)
 
 
 def _lines(size: float, level: PadLevel) -> np.ndarray:

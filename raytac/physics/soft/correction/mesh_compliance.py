@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from raytac.physics.soft.mesh import OWN_VOLUME, PadMesh
+from raytac.physics.soft.mesh import PadMesh
 from raytac.specs.sensor import GelpadSpec
 
 _SAME_PLACE = 1e-9
@@ -63,7 +63,7 @@ def rest_stiffness(mesh: PadMesh, gelpad: GelpadSpec) -> _Sparse:
 
     A tetrahedron of volume V whose shape functions have gradients g adds V (λ g_a g_bᵀ + μ g_b g_aᵀ + μ (g_a · g_b) 1) to block (a, b).
     In a volume block b its λ is λ' − μ, and the block adds (λ + μ − λ')/V_b q qᵀ with q = Σ V g: the coefficient of (J − 1)² in the
-    solver's energy is λ + μ, of which the tetrahedron keeps λ' = ``OWN_VOLUME`` μ (``ipc.solver.dilation``).
+    solver's energy is λ + μ, of which the tetrahedron keeps λ' = ``own_volume`` μ (``ipc.solver.dilation``).
     """
     vertices, tets = mesh.tets.vertices, mesh.tets.tets
     young, nu = gelpad.youngs_modulus, gelpad.poisson_ratio
@@ -76,7 +76,7 @@ def rest_stiffness(mesh: PadMesh, gelpad: GelpadSpec) -> _Sparse:
     volume = np.abs(np.linalg.det(edges)) / 6.0
     own = np.full(len(tets), lame)
     if mesh.volume_blocks is not None:
-        own[mesh.volume_blocks >= 0] = (OWN_VOLUME - 1.0) * shear
+        own[mesh.volume_blocks >= 0] = (mesh.own_volume - 1.0) * shear
     block = own[:, None, None, None, None] * outer + shear * np.swapaxes(outer, 3, 4)
     block += shear * np.einsum("tac,tbc->tab", slope, slope)[..., None, None] * np.eye(3)
     block *= volume[:, None, None, None, None]
@@ -92,7 +92,7 @@ def rest_stiffness(mesh: PadMesh, gelpad: GelpadSpec) -> _Sparse:
         total = np.bincount(where.ravel(), (volume[inside, None, None] * slope[inside]).ravel())
         rows.append(np.repeat(unknown, len(unknown)))
         columns.append(np.tile(unknown, len(unknown)))
-        values.append(((lame + shear - OWN_VOLUME * shear) / volume[inside].sum() * total[:, None] * total).ravel())
+        values.append(((lame + shear - mesh.own_volume * shear) / volume[inside].sum() * total[:, None] * total).ravel())
     row, column, value = (np.concatenate(parts) for parts in (rows, columns, values))
     order = np.argsort(row * 3 * n + column, kind="stable")
     return _Sparse(row[order], column[order], value[order], (3 * n, 3 * n))
