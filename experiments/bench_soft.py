@@ -64,7 +64,7 @@ STEP = 1e-4
 COARSE, MEDIUM = PAD_LEVELS["coarse"], PAD_LEVELS["medium"]
 STUDY = {
     "coarse_2.5_plain": replace(COARSE, spread=2.5, layer_spread=2.0, block=None),
-    "coarse_6_plain": replace(COARSE, block=None),
+    "coarse_6_plain": replace(COARSE, layer_spread=2.0, block=None),
     "coarse_2.5_blocks": replace(COARSE, spread=2.5, layer_spread=2.0),
     "coarse_4_blocks": replace(COARSE, spread=4.0, layer_spread=2.5),
     "coarse_6_blocks_0": replace(COARSE, own_volume=0.0),
