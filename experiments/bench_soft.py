@@ -38,12 +38,8 @@ from experiments.running import recorded, run
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io import CommonOptions, Metric, parse_names
-from raytac.physics import Ipc, PadLevel, SoftPad, pad_mesh
-from raytac.physics.objects import object_parts
-from raytac.physics.soft.bodies import pad_body
-from raytac.physics.soft.mesh import PAD_LEVELS
+from raytac.physics import PAD_LEVELS, Ipc, PadLevel, SoftPad, object_parts, pad_body, pad_mesh, scene_body
 from raytac.sensor import TactileSensor
-from raytac.shapes.triangulate import object_surface
 from raytac.specs import PADS, GelpadSpec, ObjectSpec, PressScene, SensorSpec, StageSpec, load_press, load_sensor
 
 DEPTH, STEPS = 0.8e-3, 8
@@ -225,7 +221,9 @@ def pressed(
     """Normal force of a tool [N] at its depth without the stand-off, and what its steps cost."""
     thing, depth = TOOLS[tool]
     mesh = pad_mesh(gelpad, level)
-    surface = object_surface(object_parts(thing), 0.1 * mesh.d_hat)
+    solid = scene_body("tool", object_parts(thing), "kinematic", sag=0.1 * mesh.d_hat).solid
+    assert isinstance(solid, ipc.KinematicBody)
+    surface = solid.surface
     vertices = surface.vertices @ ipc.rotation_matrix(thing.quaternion).T
     vertices[:, 2] -= vertices[:, 2].min()
     start = 1.2 * mesh.d_hat

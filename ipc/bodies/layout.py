@@ -326,11 +326,11 @@ def _volume_blocks(of_bodies: Sequence[NDArray], tets: Ints, nodes: int) -> dict
     """Blocks of all bodies, renumbered from 0, by the names of :class:`Layout`."""
     tagged = np.concatenate([np.stack([np.full(len(of), k), of], axis=1) for k, of in enumerate(of_bodies)])
     inside = np.flatnonzero(tagged[:, 1] >= 0)
-    found, number = np.unique(tagged[inside], axis=0, return_inverse=True)
+    names, number = np.unique(tagged[inside], axis=0, return_inverse=True)
     number = number.reshape(-1)
     volume_block = np.full(len(tets), -1)
     volume_block[inside] = number
-    tet_start, order = _groups(number, len(found))
+    tet_start, order = _groups(number, len(names))
     keys = number[:, None].astype(np.int64) * nodes + tets[inside]
     pairs, which = np.unique(keys, return_inverse=True)
     corner_start, corner = _groups(which.ravel(), len(pairs))
@@ -341,7 +341,7 @@ def _volume_blocks(of_bodies: Sequence[NDArray], tets: Ints, nodes: int) -> dict
         "block_tet": _ints(inside[order]),
         "pair_block": _ints(pairs // nodes),
         "pair_node": _ints(pairs % nodes),
-        "block_pair_start": _starts(np.bincount(pairs // nodes, minlength=len(found))),
+        "block_pair_start": _starts(np.bincount(pairs // nodes, minlength=len(names))),
         "pair_corner_start": corner_start,
         "pair_corner": _ints(4 * inside[corner // 4] + corner % 4),
         "node_pair_start": node_start,
