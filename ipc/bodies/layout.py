@@ -322,7 +322,7 @@ def _starts(lengths: Iterable[int]) -> Ints:
     return _ints([0, *np.cumsum(list(lengths))])
 
 
-def _volume_blocks(of_bodies: Sequence[NDArray], tets: Ints, nodes: int) -> dict[str, Ints]:
+def _volume_blocks(of_bodies: Sequence[NDArray], tets: Ints, nodes: int) -> Arrays:
     """Blocks of all bodies, renumbered from 0, by the names of :class:`Layout`."""
     tagged = np.concatenate([np.stack([np.full(len(of), k), of], axis=1) for k, of in enumerate(of_bodies)])
     inside = np.flatnonzero(tagged[:, 1] >= 0)

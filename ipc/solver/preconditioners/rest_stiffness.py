@@ -90,7 +90,8 @@ def _rest_rows(layout: Layout) -> Floats:
     which = np.repeat(np.arange(len(layout.pair_node)), np.diff(layout.pair_corner_start))
     slopes = layout.volume[e, None] * layout.grads[e, a]
     sums = np.stack([np.bincount(which, weights=slopes[:, c], minlength=len(layout.pair_node)) for c in range(3)], axis=1)
-    return np.sqrt(layout.block_lam / layout.block_volume)[layout.pair_block, None] * sums
+    scale: Floats = np.sqrt(layout.block_lam / layout.block_volume)
+    return scale[layout.pair_block, None] * sums.astype(np.float64)
 
 
 def dense_block(layout: Layout, blocks: Floats, rows: Ints, cols: Ints) -> Floats:

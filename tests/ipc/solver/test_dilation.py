@@ -228,7 +228,7 @@ def wave_compliance(poisson: float, cells: tuple[int, int, int], block: tuple[in
     """Deflection of a bonded layer under a pressure wave of four thicknesses, over the closed form."""
     thickness, length, young = 1e-3, 2e-3, 1e5
     lines = [np.linspace(0, top, n + 1) for top, n in zip((length, length / cells[0] * cells[1], thickness), cells, strict=True)]
-    mesh = ipc.box_mesh(*lines)
+    mesh = ipc.box_mesh(lines[0], lines[1], lines[2])
     solver = make_potential(
         ipc.Material(young, poisson, model=model), mesh, blocks=None if block is None else ipc.grid_blocks(cells, block)
     )
