@@ -12,12 +12,20 @@ A ball (3.155 mm, the scene "sphere") is pressed 0.8 mm into the GelSight Mini's
   (29,000 vertices; minutes), else the last level asked for stands in.
 - ``soft.<level>.imprint_error``: deepest imprint against the commanded depth. ``…force_n``: what the depth takes, beside ``law.force_n`` of
   the bonded layer (Dimitriadis et al. 2002), which is an approximation itself.
+- ``soft.<level>.force_error.ball``, ``….cylinder``, ``….punch``: force at a depth over that of the fine level, less 1, and
+  ``soft.fine.force_n.<tool>`` itself: a ball of 3.155 mm 0.8 mm deep, a lying cylinder of 4 mm by 10 mm 0.5 mm deep, and the flat end of
+  one of 1.5 mm 0.3 mm deep, on the pad without its dome and without friction, at a place (0.13, 0.09) mm off the middle that is on no
+  symmetry of a mesh. The stand-off is taken out: the tool is lower by the mean gap, weighted by force, than the depth. Beside them what
+  they cost: ``soft.<level>.solver_ms`` (a step of 0.1 mm, ball; processor time, on CUDA wall time), ``….newton`` and ``….pcg`` a step, and
+  ``….least_det_f`` over the three. ``--forces`` leaves everything else out. ``--study`` adds ``soft.study.<name>.*`` of other gradings and
+  volume blocks, and of the coarse level at four other places.
 - ``force.driven_error``, ``force.weight_error``: force on the case (bonded vertices) when 1 N is asked for; force on the coat under a free
   object of 0.3 N.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, replace
 from typing import Annotated
@@ -25,17 +33,44 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+import ipc
 from experiments.running import recorded, run
+from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io import CommonOptions, Metric, parse_names
-from raytac.physics import Ipc, PadLevel, SoftPad, pad_mesh
+from raytac.physics import PAD_LEVELS, Ipc, PadLevel, SoftPad, object_parts, pad_body, pad_mesh, scene_body
 from raytac.sensor import TactileSensor
-from raytac.specs import PADS, PressScene, SensorSpec, StageSpec, load_press, load_sensor
+from raytac.specs import PADS, GelpadSpec, ObjectSpec, PressScene, SensorSpec, StageSpec, load_press, load_sensor
 
 DEPTH, STEPS = 0.8e-3, 8
 REFINED = PadLevel(0.45e-3, 10, 5.0, 3.0, 1e-5)
 """Cells of 0.2 mm in the middle, 10 layers."""
 AROUND = 3e-3
+TOOLS = {
+    "ball": (ObjectSpec("sphere", {"radius": 3.155e-3}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.05), 0.8e-3),
+    "cylinder": (
+        ObjectSpec("cylinder", {"radius": 4e-3, "length": 10e-3}, (0.0, 0.0, 0.0), (0.5**0.5, 0.0, 0.5**0.5, 0.0), 0.05),
+        0.5e-3,
+    ),
+    "punch": (ObjectSpec("cylinder", {"radius": 1.5e-3, "length": 5e-3}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.05), 0.3e-3),
+}
+"""Tools of the force errors and their depths [m]."""
+OFF_CENTRE = 0.13e-3, 0.09e-3
+STEP = 1e-4
+COARSE, MEDIUM = PAD_LEVELS["coarse"], PAD_LEVELS["medium"]
+STUDY = {
+    "coarse_2.5_plain": replace(COARSE, spread=2.5, layer_spread=2.0, block=None),
+    "coarse_6_plain": replace(COARSE, layer_spread=2.0, block=None),
+    "coarse_2.5_blocks": replace(COARSE, spread=2.5, layer_spread=2.0),
+    "coarse_4_blocks": replace(COARSE, spread=4.0, layer_spread=2.5),
+    "coarse_6_blocks_0": replace(COARSE, own_volume=0.0),
+    "coarse_6_blocks_0.5": replace(COARSE, own_volume=0.5),
+    "coarse_6_blocks_1": replace(COARSE, own_volume=1.0),
+    "medium_blocks_0": replace(MEDIUM, block=(2, 2, 1), own_volume=0.0),
+    "medium_blocks_1": replace(MEDIUM, block=(2, 2, 1), own_volume=1.0),
+}
+"""Gradings, blocks and λ'/μ beside those of the levels."""
+PLACES = (-0.31e-3, 0.22e-3), (0.6e-3, -0.4e-3), (2.1e-3, 1.3e-3), (4.13e-3, 3.09e-3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +83,10 @@ class Args(CommonOptions):
     """Presses that are timed, after one that is not."""
     refined: bool = False
     """Compute the refined solution."""
+    forces: bool = False
+    """Measure the force errors of the levels against the fine one, and nothing else."""
+    study: bool = False
+    """Measure the same for other gradings and volume blocks than the levels have."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
 
@@ -57,7 +96,14 @@ class Args(CommonOptions):
             if level not in PADS:
                 raise InputError("levels", value=level, rule="must be a known level", choices=PADS)
         with recorded(self, "bench_soft", owned=("metrics.json",), packages=("warp-lang",)) as (_, metrics):
-            metrics |= measured(load_sensor(self.sensor), levels, self.refined, self.presses, self.device, self.seed)
+            spec = load_sensor(self.sensor)
+            device = resolve_device(self.device, ray_tracing=False)
+            metrics |= force_errors(spec.gelpad, levels, device)
+            if self.study:
+                fine = {tool: float(metrics[f"soft.fine.force_n.{tool}"]) for tool in TOOLS}
+                metrics |= studied(spec.gelpad, fine, device)
+            if not self.forces:
+                metrics |= measured(spec, levels, self.refined, self.presses, self.device, self.seed)
         for key, value in metrics.items():
             if not key.startswith("versions"):
                 print(f"{key} = {value:.5g}" if isinstance(value, float) else f"{key} = {value}")
@@ -130,6 +176,84 @@ def forces(spec: SensorSpec) -> dict[str, Metric]:
             borne = -pad.solver.world.wrench("pad").force[0, 2]
         found[f"force.{key}_error"] = float(borne) / force - 1.0
     return found
+
+
+def force_errors(gelpad: GelpadSpec, levels: tuple[str, ...], device: str) -> dict[str, Metric]:
+    """Force of every tool on each level against the fine one, and the cost of it."""
+    flat = replace(gelpad, dome_radius=(math.inf, math.inf))
+    found: dict[str, Metric] = {}
+    fine: dict[str, float] = {}
+    for level in ["fine", *(level for level in levels if level != "fine")]:
+        least = 1.0
+        for tool in TOOLS:
+            force, cost = pressed(flat, level, tool, device)
+            least = min(least, cost.pop("least_det_f"))
+            if level == "fine":
+                fine[tool] = found[f"soft.fine.force_n.{tool}"] = force
+            else:
+                found[f"soft.{level}.force_error.{tool}"] = force / fine[tool] - 1.0
+            if tool == "ball":
+                found |= {f"soft.{level}.{name}": value for name, value in cost.items()}
+        found[f"soft.{level}.least_det_f"] = least
+        print(f"{level}: pressed by {', '.join(TOOLS)}", flush=True)
+    return found
+
+
+def studied(gelpad: GelpadSpec, fine: dict[str, float], device: str) -> dict[str, Metric]:
+    """Force errors and costs of ``STUDY``, and of the coarse level at ``PLACES``."""
+    flat = replace(gelpad, dome_radius=(math.inf, math.inf))
+    runs = [(name, level, OFF_CENTRE) for name, level in STUDY.items()]
+    runs += [(f"coarse_at_{1e3 * x:.2f}_{1e3 * y:.2f}", COARSE, (x, y)) for x, y in PLACES]
+    runs += [(f"plain_at_{1e3 * x:.2f}_{1e3 * y:.2f}", STUDY["coarse_2.5_plain"], (x, y)) for x, y in PLACES]
+    found: dict[str, Metric] = {}
+    for name, level, place in runs:
+        for tool in TOOLS:
+            force, cost = pressed(flat, level, tool, device, place)
+            found[f"soft.study.{name}.force_error.{tool}"] = force / fine[tool] - 1.0
+            found |= {f"soft.study.{name}.{tool}.{key}": value for key, value in cost.items()}
+        print(f"study: {name}", flush=True)
+    return found
+
+
+def pressed(
+    gelpad: GelpadSpec, level: str | PadLevel, tool: str, device: str, place: tuple[float, float] = OFF_CENTRE
+) -> tuple[float, dict[str, float]]:
+    """Normal force of a tool [N] at its depth without the stand-off, and what its steps cost."""
+    thing, depth = TOOLS[tool]
+    mesh = pad_mesh(gelpad, level)
+    solid = scene_body("tool", object_parts(thing), "kinematic", sag=0.1 * mesh.d_hat).solid
+    assert isinstance(solid, ipc.KinematicBody)
+    surface = solid.surface
+    vertices = surface.vertices @ ipc.rotation_matrix(thing.quaternion).T
+    vertices[:, 2] -= vertices[:, 2].min()
+    start = 1.2 * mesh.d_hat
+    body = ipc.KinematicBody("tool", ipc.TriMesh(vertices, surface.faces), ipc.Pose((*place, start)))
+    settings = ipc.Settings(d_hat=mesh.d_hat, velocity_tolerance=5e-5)
+    world = ipc.World([pad_body(mesh, gelpad), body], settings, device=device)
+
+    def step(height: float) -> ipc.StepReport:
+        world.set_target("tool", (*place, height))
+        report = world.step()
+        if not report.converged[0]:
+            raise ArithmeticError(f"{level}: the {tool} at {height} m did not converge")
+        return report
+
+    steps = math.ceil((depth + start) / STEP)
+    step(start)  # compiles
+    clock = time.process_time if device == "cpu" else time.perf_counter
+    began = clock()
+    reports = [step(start - (depth + start) * k / steps) for k in range(1, steps + 1)]
+    seconds = clock() - began
+    for _ in range(4):
+        pairs = world.contacts()
+        reports.append(step(float(pairs.gap @ pairs.force) / float(pairs.force.sum()) - depth))
+    cost = {
+        "solver_ms": 1e3 * seconds / steps,
+        "newton": sum(float(r.newton[0]) for r in reports[:steps]) / steps,
+        "pcg": sum(float(r.linear[0]) for r in reports[:steps]) / steps,
+        "least_det_f": min(float(r.min_det[0]) for r in reports),
+    }
+    return float(world.wrench("tool").force[0, 2]), cost
 
 
 def layer_law(spec: SensorSpec) -> float:

@@ -12,6 +12,7 @@ IntArray, IntArray2d = wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
 FloatArray, FloatArray2d = wp.array(dtype=wp.float64), wp.array2d(dtype=wp.float64)
 SingleArray2d, SingleArray3d = wp.array2d(dtype=wp.float32), wp.array3d(dtype=wp.float32)
 VecArray, VecArray2d = wp.array(dtype=wp.vec3d), wp.array2d(dtype=wp.vec3d)
+Vec4Array2d = wp.array2d(dtype=wp.vec4d)
 MatArray2d, QuatArray2d = wp.array2d(dtype=wp.mat33d), wp.array2d(dtype=wp.quatd)
 
 

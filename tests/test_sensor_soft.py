@@ -134,19 +134,21 @@ def ball(radius, *stages):
 
 def test_a_contact_of_few_cells_is_warned_of_once_a_press():
     deep, sideways = StageSpec("indent", depth=0.3e-3), StageSpec("shear", shear=(1e-4, 0.0))
-    frames, told = loop(ball(3e-3, deep, sideways))
+    frames, told = loop(ball(1.5e-3, deep, sideways))
     assert len(frames) == 7 and frames[0].contact_cells.shape == (1,) and np.isnan(frames[0].contact_cells[0])
     assert 1.0 < frames[3].contact_cells[0] < 3.0
     assert len(told) == 1
     width = f"{frames[3].contact_cells[0]:.1f} cells across"
-    assert all(word in told[0] for word in ("level = 'coarse'", width, "at least 6", "choose level='medium'"))
+    assert all(word in told[0] for word in ("level = 'coarse'", width, "at least 6", "choose level='fine'"))
 
 
 def test_neither_a_wide_contact_nor_a_given_force_nor_an_image_is_warned_of():
     frames, told = loop(ball(15e-3, StageSpec("indent", depth=0.8e-3)))
     assert frames[-1].contact_cells[0] > 6.0 and not told
+    frames, told = loop(ball(8e-3, StageSpec("indent", depth=0.8e-3)))
+    assert frames[-1].contact_cells[0] > 6.0 and not told
     assert np.nanmin(frames[1].contact_cells) < 6.0  # narrow on the way, as every contact is
-    frames, told = loop(ball(3e-3, StageSpec("indent", force=0.2), StageSpec("shear", shear=(1e-4, 0.0))))
+    frames, told = loop(ball(1.5e-3, StageSpec("indent", force=0.2), StageSpec("shear", shear=(1e-4, 0.0))))
     assert frames[-1].contact_cells[0] < 3.0 and not told
     frames, told = loop(ball(3e-3, StageSpec("indent", depth=0.3e-3)), outputs=("height",))
     assert "contact_cells" not in frames[-1].outputs and not told

@@ -57,6 +57,11 @@ class SoftBody:
         self_contact: if True, the body's surface may touch itself.
         grips: further sets of vertices, each bonded exactly to a moving frame of its own, which is driven under the name
             ``"<body>.<grip>"`` and begins at ``pose``; they need ``bonded`` vertices beside them, whose frame the body is solved in.
+        volume_blocks: number of each tetrahedron's volume block, shape (T,), or −1 for none. The tetrahedra of a block resist the change
+            of their mean dilation instead of each its own, so that a nearly incompressible body does not lock
+            (``ipc.solver.dilation``); ``ipc.grid_blocks`` makes blocks of the cells of a grid. None: no blocks.
+        own_volume: stiffness of each tetrahedron of a block against a change of its own volume, λ'/μ, at most λ/μ: 0 may let a free
+            surface wrinkle, and λ/μ is a body without blocks.
     """
 
     name: str
@@ -66,6 +71,8 @@ class SoftBody:
     pose: Pose = Pose()
     self_contact: bool = False
     grips: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)
+    volume_blocks: NDArray[np.int64] | None = None
+    own_volume: float = 0.0
 
     def __post_init__(self) -> None:
         bonded = self._vertices("bonded", self.bonded)
@@ -77,6 +84,15 @@ class SoftBody:
             raise IpcError(f"{self.name}: a vertex is held twice, by bonded or grips {', '.join(grips)}")
         object.__setattr__(self, "bonded", bonded)
         object.__setattr__(self, "grips", grips)
+        mu, lam = self.material.coefficients()
+        if not 0 <= self.own_volume <= lam / mu:
+            raise IpcError(f"{self.name}: own_volume = {self.own_volume}: it must lie in [0, λ/μ], here [0, {lam / mu:.4g}]")
+        if self.volume_blocks is not None:
+            blocks = np.asarray(self.volume_blocks)
+            if blocks.shape != (len(self.mesh.tets),) or not np.issubdtype(blocks.dtype, np.integer) or blocks.min() < -1:
+                rule = f"they must be whole numbers of at least −1, shape ({len(self.mesh.tets)},), one a tetrahedron"
+                raise IpcError(f"{self.name}: volume_blocks of shape {blocks.shape} and type {blocks.dtype}: {rule}")
+            object.__setattr__(self, "volume_blocks", blocks.astype(np.int64))
 
     def _vertices(self, what: str, ids: ArrayLike) -> NDArray[np.int64]:
         unique = np.unique(np.asarray(ids, dtype=np.int64))

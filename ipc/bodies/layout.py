@@ -42,6 +42,12 @@ class Layout:
         node_drive: strength s of the drive (N,).    node_aim: its frame, −1 without (N,).    aim_local: position there [m] (N, 3).
         tets: nodes (T, 4).    grads: ∇w of each corner [1/m] (T, 4, 3).    volume: [m³] (T,).
         model, mu, lam: energy code and coefficients [Pa] (T,).
+        volume_block: number of the volume block that an element belongs to, −1 for none (T,).    own: λ' of elements [Pa] (T,).
+        block_tet_start (Q+1,), block_tet: elements of each of Q volume blocks.    block_volume [m³], block_lam [Pa], block_rest (Q,): V_b,
+            λ − λ' and a of ``ipc.solver.dilation``.
+        pair_block, pair_node (S,): pairs of a volume block and a node of it, by block.    block_pair_start (Q+1,): first of each block.
+            pair_corner_start (S+1,), pair_corner: 4·element + a for each element of the block at the node.
+        node_pair_start (N+1,), node_pair: the pairs that a node is in.
         row_start (N+1,), col (K,): block pattern of the matrix.    mass: [kg] (K,).
         part_start (K+1,), part: 16·element + 4·a + b for each contribution to a block.
         corner_start (N+1,), corner: 4·element + a for each element at a node.
@@ -81,6 +87,20 @@ class Layout:
     model: Ints
     mu: Floats
     lam: Floats
+    volume_block: Ints
+    own: Floats
+    block_tet_start: Ints
+    block_tet: Ints
+    block_volume: Floats
+    block_lam: Floats
+    block_rest: Floats
+    pair_block: Ints
+    pair_node: Ints
+    block_pair_start: Ints
+    pair_corner_start: Ints
+    pair_corner: Ints
+    node_pair_start: Ints
+    node_pair: Ints
     row_start: Ints
     col: Ints
     mass: Floats
@@ -107,7 +127,7 @@ class Layout:
     max_young: float
 
 
-_NUMBERS = ("node_rest", "node_damping", "node_drive", "aim_local", "grads", "volume", "mu", "lam")
+_NUMBERS = ("node_rest", "node_damping", "node_drive", "aim_local", "grads", "volume", "mu", "lam", "own")
 """Fields of :class:`Layout` that are those of the bodies, one after the other."""
 
 
@@ -168,6 +188,7 @@ def _soft(body: SoftBody) -> tuple[TriMesh, Arrays]:
     free = np.ones(len(x))
     free[np.concatenate([body.bonded, *body.grips.values()])] = 0
     mu, lam = body.material.coefficients()
+    blocks = np.full(len(tets), -1) if body.volume_blocks is None else body.volume_blocks
     used, local = np.unique(surface_of(tets), return_inverse=True)
     return TriMesh(x[used], local.reshape(-1, 3)), {
         "node_rest": placed,
@@ -181,6 +202,8 @@ def _soft(body: SoftBody) -> tuple[TriMesh, Arrays]:
         "model": np.full(len(tets), MODEL_CODES[body.material.model]),
         "mu": np.full(len(tets), mu),
         "lam": np.full(len(tets), lam),
+        "volume_block": blocks,
+        "own": np.where(blocks < 0, lam, body.own_volume * mu),
         "mass_row": np.arange(len(x)),
         "mass_col": np.arange(len(x)),
         "mass": lumped,
@@ -206,6 +229,8 @@ def _affine(body: AffineBody) -> tuple[TriMesh, Arrays]:
         "model": np.array([MODEL_CODES["orthogonal"]]),
         "mu": np.array([body.material.stiffness]),
         "lam": np.zeros(1),
+        "volume_block": np.full(1, -1),
+        "own": np.zeros(1),
         "mass_row": row.ravel(),
         "mass_col": col.ravel(),
         "mass": mass.ravel(),
@@ -297,6 +322,33 @@ def _starts(lengths: Iterable[int]) -> Ints:
     return _ints([0, *np.cumsum(list(lengths))])
 
 
+def _volume_blocks(of_bodies: Sequence[NDArray], tets: Ints, nodes: int) -> Arrays:
+    """Blocks of all bodies, renumbered from 0, by the names of :class:`Layout`."""
+    tagged = np.concatenate([np.stack([np.full(len(of), k), of], axis=1) for k, of in enumerate(of_bodies)])
+    inside = np.flatnonzero(tagged[:, 1] >= 0)
+    names, number = np.unique(tagged[inside], axis=0, return_inverse=True)
+    number = number.reshape(-1)
+    volume_block = np.full(len(tets), -1)
+    volume_block[inside] = number
+    tet_start, order = _groups(number, len(names))
+    keys = number[:, None].astype(np.int64) * nodes + tets[inside]
+    pairs, which = np.unique(keys, return_inverse=True)
+    corner_start, corner = _groups(which.ravel(), len(pairs))
+    node_start, node_pair = _groups(pairs % nodes, nodes)
+    return {
+        "volume_block": _ints(volume_block),
+        "block_tet_start": tet_start,
+        "block_tet": _ints(inside[order]),
+        "pair_block": _ints(pairs // nodes),
+        "pair_node": _ints(pairs % nodes),
+        "block_pair_start": _starts(np.bincount(pairs // nodes, minlength=len(names))),
+        "pair_corner_start": corner_start,
+        "pair_corner": _ints(4 * inside[corner // 4] + corner % 4),
+        "node_pair_start": node_start,
+        "node_pair": node_pair,
+    }
+
+
 def build_layout(
     bodies: Sequence[Body], friction: float, exceptions: Mapping[tuple[str, str], float], ignored: Sequence[tuple[str, str]]
 ) -> Layout:
@@ -350,6 +402,11 @@ def build_layout(
     blocks, which = np.unique(rows * n + cols, return_inverse=True)
     part_start, part = _groups(which[: 16 * len(tets)], len(blocks))
     corner_start, corner = _groups(tets.ravel(), n)
+    volumes = _volume_blocks([arrays["volume_block"] for _, arrays in parts if "volume_block" in arrays], tets, n)
+    first = volumes["block_tet"][volumes["block_tet_start"][:-1]]
+    block_mu, block_lam, log = joined("mu")[first], joined("lam")[first], joined("model")[first] == MODEL_CODES["stable_log"]
+    weights = joined("volume")[volumes["block_tet"]]
+    block_of = np.repeat(np.arange(len(first)), np.diff(volumes["block_tet_start"]))
     vert_count, vert_weight = _ints(joined("vert_count")), _floats(joined("vert_weight"))
     slots = np.arange(4)[None] < vert_count[:, None]
     vert_nodes = _ints(np.where(slots, joined("vert_nodes", node_start), 0))
@@ -369,6 +426,9 @@ def build_layout(
         node_body=np.repeat(np.arange(len(bodies), dtype=np.int32), np.diff(node_start)),
         tets=tets,
         model=_ints(joined("model")),
+        block_volume=_floats(np.bincount(block_of, weights, minlength=len(first))),
+        block_lam=_floats(block_lam - joined("own")[first]),
+        block_rest=_floats(np.where(log, 1.0 + 0.75 * block_mu / block_lam, 1.0)),
         row_start=_starts(np.bincount(blocks // n, minlength=n)),
         col=_ints(blocks % n),
         mass=_floats(np.bincount(which[16 * len(tets) :], weights=joined("mass"), minlength=len(blocks))),
@@ -395,4 +455,5 @@ def build_layout(
         max_young=max((body.material.young for body in bodies if isinstance(body, SoftBody)), default=0.0),
         **{name: _floats(joined(name)) for name in _NUMBERS},
         **frames,
+        **volumes,
     )

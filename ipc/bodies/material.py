@@ -17,7 +17,7 @@ class Material:
 
     Attributes:
         young: Young's modulus E [Pa], at small strain.
-        poisson: Poisson's ratio ν [-], in [0, 0.5). Linear tetrahedra lock as ν nears 0.5; 0.45 suits a silicone pad.
+        poisson: Poisson's ratio ν [-], in [0, 0.5). Linear tetrahedra lock as ν nears 0.5, unless a body has ``volume_blocks``.
         density: mass density ρ [kg/m³].
         model: ``"stable"``: Ψ = μ/2 (I_C − 3) − μ (J − 1) + λ/2 (J − 1)²; ``"stable_log"``: the form of Smith et al. 2018, eq. 14,
             Ψ = μ/2 (I_C − 3) + λ/2 (J − a)² − μ/2 ln(I_C + 1), a = 1 + 3μ/(4λ), for which F = 0 is no stable point. Both have a barrier

@@ -127,6 +127,27 @@ def box_mesh(x: ArrayLike, y: ArrayLike, z: ArrayLike, cut: Cut = "mirrored") ->
     return TetMesh(vertices, tets)
 
 
+def grid_blocks(cells: tuple[int, int, int], block: tuple[int, int, int] = (2, 2, 1)) -> NDArray[np.int64]:
+    """Volume block of each tetrahedron of a ``box_mesh`` or ``domed_pad``, shape (T,).
+
+    Blocks in x and y are counted from the low side and in z from the top; the last of a direction may have fewer cells.
+
+    Args:
+        cells: number of cells of the grid in x, y and z.
+        block: cells of a block in x, y and z. Of mirrored cells, (2, 2, 1) has 18 vertices and (2, 2, 2), the barycentric subdivision of
+            a cube, 27.
+
+    Raises:
+        IpcError: a number below 1.
+    """
+    if min(*cells, *block) < 1:
+        raise IpcError(f"grid_blocks(cells={cells}, block={block}): all numbers must be at least 1")
+    count = [-(-n // b) for n, b in zip(cells, block, strict=True)]
+    k, j, i = (a.ravel() for a in np.meshgrid(*(np.arange(n) for n in reversed(cells)), indexing="ij"))
+    number = ((cells[2] - 1 - k) // block[2] * count[1] + j // block[1]) * count[0] + i // block[0]
+    return np.repeat(number, len(_KUHN))
+
+
 def domed_pad(
     size: tuple[float, float],
     thickness: float,

@@ -17,6 +17,10 @@ second derivative is
 and every term but the last is positive semi-definite. The blocks need no 9×9 matrix: with g_a = ∇w_a, the last term couples corners
 a and b by −c [F (g_a × g_b)]_×. Where the matrix must be positive semi-definite, ``geometric_factor`` shrinks c toward 0 until it is;
 the semi-definite set of c is an interval around 0, computed from the singular values (Smith et al. 2018, section 4, gives the modes).
+
+Elements of a volume block keep λ' of the λ in λ/2 (J − 1)² or λ/2 (J − a)²; the rest, λ − λ', has the block's mean dilation J̄ in the place
+of J, and so in c, and l has λ' for λ. What the mean adds to the second derivative, a term of rank one a block, is in
+``ipc/solver/dilation.py``.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -26,7 +30,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, MatArray2d, VecArray2d
+from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, MatArray2d, Vec4Array2d, VecArray2d
 from ipc.contact.barrier import barrier, barrier_first, barrier_second
 from ipc.solver.dynamics import Masses
 
@@ -35,7 +39,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Elements:
-    """Tetrahedra: nodes, ∇w of corners [1/m], volume [m³], energy code, coefficients [Pa]."""
+    """Tetrahedra: nodes, ∇w of corners [1/m], volume [m³], energy code, coefficients [Pa].
+
+    ``volume_block``: number of the block that shares its mean dilation, or −1.    ``own``: λ' [Pa], λ itself without a block.
+    """
 
     tets: IntArray2d
     grads: VecArray2d
@@ -43,6 +50,8 @@ class Elements:
     model: IntArray
     mu: FloatArray
     lam: FloatArray
+    volume_block: IntArray
+    own: FloatArray
 
 
 @wp.func
@@ -83,8 +92,10 @@ def squeeze_second(det: wp.float64) -> wp.float64:
 
 
 @wp.func
-def strain_energy(F: wp.mat33d, model: wp.int32, mu: wp.float64, lam: wp.float64) -> wp.float64:
-    """Ψ(F) [J/m³]."""
+def strain_energy(
+    F: wp.mat33d, mean: wp.float64, own: wp.float64, model: wp.int32, mu: wp.float64, lam: wp.float64
+) -> wp.float64:
+    """Ψ(F) [J/m³]; ``mean`` is the mean dilation of the element's block, ``own`` λ'."""
     one, half = wp.float64(1.0), wp.float64(0.5)
     ic = wp.ddot(F, F)
     J = wp.determinant(F)
@@ -93,16 +104,23 @@ def strain_energy(F: wp.mat33d, model: wp.int32, mu: wp.float64, lam: wp.float64
         return mu * wp.ddot(C, C)
     if model == 1:
         a = one + wp.float64(0.75) * mu / lam
-        base = half * mu * (ic - wp.float64(3.0)) + half * lam * (J - a) * (J - a) - half * mu * wp.log(ic + one)
+        base = (
+            half * mu * (ic - wp.float64(3.0))
+            + half * (own * (J - a) * (J - a) + (lam - own) * (mean - a) * (mean - a))
+            - half * mu * wp.log(ic + one)
+        )
         return base + lam * squeeze(J)
-    return half * mu * (ic - wp.float64(3.0)) - mu * (J - one) + half * lam * (J - one) * (J - one) + lam * squeeze(J)
+    volumetric = half * (own * (J - one) * (J - one) + (lam - own) * (mean - one) * (mean - one))
+    return half * mu * (ic - wp.float64(3.0)) - mu * (J - one) + volumetric + lam * squeeze(J)
 
 
 @wp.func
-def stress_factors(F: wp.mat33d, J: wp.float64, model: wp.int32, mu: wp.float64, lam: wp.float64) -> wp.vec3d:
+def stress_factors(
+    F: wp.mat33d, J: wp.float64, mean: wp.float64, own: wp.float64, model: wp.int32, mu: wp.float64, lam: wp.float64
+) -> wp.vec3d:
     """(m, c, k) of the module's docstring [Pa]."""
     one = wp.float64(1.0)
-    pressure = lam * (J - one + squeeze_first(J))
+    pressure = own * (J - one) + (lam - own) * (mean - one) + lam * squeeze_first(J)
     if model == 1:
         q = one / (wp.ddot(F, F) + one)
         return wp.vec3d(mu * (one - q), pressure - wp.float64(0.75) * mu, wp.float64(2.0) * mu * q * q)
@@ -110,11 +128,10 @@ def stress_factors(F: wp.mat33d, J: wp.float64, model: wp.int32, mu: wp.float64,
 
 
 @wp.func
-def first_piola(F: wp.mat33d, J: wp.float64, model: wp.int32, mu: wp.float64, lam: wp.float64) -> wp.mat33d:
-    """P = ∂Ψ/∂F [Pa]."""
+def first_piola(F: wp.mat33d, f: wp.vec3d, model: wp.int32, mu: wp.float64) -> wp.mat33d:
+    """P = ∂Ψ/∂F [Pa] from :func:`stress_factors`."""
     if model == 2:
         return wp.float64(4.0) * mu * (F * wp.transpose(F) - wp.identity(n=3, dtype=wp.float64)) * F
-    f = stress_factors(F, J, model, mu, lam)
     return f[0] * F + f[1] * cofactor(F)
 
 
@@ -153,8 +170,20 @@ def geometric_factor(F: wp.mat33d, m: wp.float64, k: wp.float64, lam: wp.float64
 
 
 @wp.func
-def strain_energy_change(F0: wp.mat33d, F1: wp.mat33d, model: wp.int32, mu: wp.float64, lam: wp.float64) -> wp.float64:
-    """Ψ(F1) − Ψ(F0) [J/m³], written in F1 − F0, so that it keeps its digits near rest."""
+def volume_change(F0: wp.mat33d, F1: wp.mat33d) -> wp.float64:
+    """det F1 − det F0, written in F1 − F0."""
+    G = F1 - F0
+    return wp.ddot(cofactor(F0), G) + wp.ddot(F0, cofactor(G)) + wp.determinant(G)
+
+
+@wp.func
+def strain_energy_change(
+    F0: wp.mat33d, F1: wp.mat33d, own: wp.float64, model: wp.int32, mu: wp.float64, lam: wp.float64
+) -> wp.float64:
+    """Ψ(F1) − Ψ(F0) [J/m³], written in F1 − F0, so that it keeps its digits near rest.
+
+    ``own``: λ', with which the element has λ'/2 (J − a)².
+    """
     one, half = wp.float64(1.0), wp.float64(0.5)
     G = F1 - F0
     if model == 2:
@@ -162,8 +191,7 @@ def strain_energy_change(F0: wp.mat33d, F1: wp.mat33d, model: wp.int32, mu: wp.f
         sum_of = F0 * wp.transpose(F0) + F1 * wp.transpose(F1) - wp.float64(2.0) * eye
         return mu * wp.ddot(G * wp.transpose(F1) + F0 * wp.transpose(G), sum_of)
     ic = wp.ddot(G, F0 + F1)
-    # det(F0 + G) − det F0, term by term
-    J = wp.ddot(cofactor(F0), G) + wp.ddot(F0, cofactor(G)) + wp.determinant(G)
+    J = volume_change(F0, F1)
     J0, J1 = wp.determinant(F0), wp.determinant(F1)
     both = J0 + J1
     barrier = lam * (squeeze(J1) - squeeze(J0))
@@ -173,8 +201,8 @@ def strain_energy_change(F0: wp.mat33d, F1: wp.mat33d, model: wp.int32, mu: wp.f
         log1p = wp.log(one + z)
         if wp.abs(z) < wp.float64(1.0e-3):
             log1p = z * (one - z * (half - z * (one / wp.float64(3.0) - z * (wp.float64(0.25) - z * wp.float64(0.2)))))
-        return half * mu * (ic - log1p) + half * lam * J * (both - wp.float64(2.0) * a) + barrier
-    return half * mu * ic - mu * J + half * lam * J * (both - wp.float64(2.0)) + barrier
+        return half * mu * (ic - log1p) + half * own * J * (both - wp.float64(2.0) * a) + barrier
+    return half * mu * ic - mu * J + half * own * J * (both - wp.float64(2.0)) + barrier
 
 
 @wp.func
@@ -191,29 +219,44 @@ def deformation(env: wp.int32, e: wp.int32, y: VecArray2d, elements: Elements) -
 def element_state(
     y: VecArray2d,
     elements: Elements,
+    dilation: FloatArray2d,
     active: IntArray,
     project: IntArray,
     # outputs
     el_F: MatArray2d,
     el_P: MatArray2d,
-    el_mck: VecArray2d,
+    el_mckl: Vec4Array2d,
     el_J: FloatArray2d,
     el_energy: FloatArray2d,
 ):
-    """F, volume·P, (m, c', k), J and energy [J] of every element of the active environments."""
+    """F, volume·P, (m, c', k, l), J and energy [J] of every element of the active environments.
+
+    ``dilation``: J̄ of every volume block. In a block, where the second derivative is projected, λ' counts as μ at least in l: without a
+    λ of its own an element would have to give up half of c even at rest, and with it the freedom to turn.
+    """
     env, e = wp.tid()
     if active[env] == 0:
         return
+    mu, lam = elements.mu[e], elements.lam[e]
     F = deformation(env, e, y, elements)
     J = wp.determinant(F)
-    f = stress_factors(F, J, elements.model[e], elements.mu[e], elements.lam[e])
+    mean = J
+    own = elements.own[e]
+    stiff = own + lam * squeeze_second(J)
+    block = elements.volume_block[e]
+    if block >= 0:
+        mean = dilation[env, block]
+        if project[env] != 0:
+            stiff += wp.max(mu - own, wp.float64(0.0))
+    f = stress_factors(F, J, mean, own, elements.model[e], mu, lam)
+    c = f[1]
     if project[env] != 0 and elements.model[e] != 2:
-        f[1] = geometric_factor(F, f[0], f[2], elements.lam[e] * (wp.float64(1.0) + squeeze_second(J)), f[1])
+        c = geometric_factor(F, f[0], f[2], stiff, c)
     el_F[env, e] = F
-    el_P[env, e] = elements.volume[e] * first_piola(F, J, elements.model[e], elements.mu[e], elements.lam[e])
-    el_mck[env, e] = f
+    el_P[env, e] = elements.volume[e] * first_piola(F, f, elements.model[e], mu)
+    el_mckl[env, e] = wp.vec4d(f[0], c, f[2], stiff)
     el_J[env, e] = J
-    el_energy[env, e] = elements.volume[e] * strain_energy(F, elements.model[e], elements.mu[e], elements.lam[e])
+    el_energy[env, e] = elements.volume[e] * strain_energy(F, mean, own, elements.model[e], mu, lam)
 
 
 @wp.kernel
@@ -240,7 +283,7 @@ def block_hessian(
     masses: Masses,
     inertia_scale: wp.float64,
     el_F: MatArray2d,
-    el_mck: VecArray2d,
+    el_mckl: Vec4Array2d,
     active: IntArray,
     # outputs
     blocks: MatArray2d,
@@ -261,7 +304,7 @@ def block_hessian(
         ga = elements.grads[e, code / 4]
         gb = elements.grads[e, code % 4]
         F = el_F[env, e]
-        f = el_mck[env, e]
+        f = el_mckl[env, e]
         ba = F * ga
         bb = F * gb
         if elements.model[e] == 2:
@@ -269,11 +312,10 @@ def block_hessian(
             H += (wp.float64(4.0) * elements.mu[e] * elements.volume[e]) * (wp.dot(ba, bb) * one + wp.outer(bb, ba))
         else:
             C = cofactor(F)
-            stiff = elements.lam[e] * (wp.float64(1.0) + squeeze_second(wp.determinant(F)))
             H += elements.volume[e] * (
                 (f[0] * wp.dot(ga, gb)) * one
                 + f[2] * wp.outer(ba, bb)
-                + stiff * wp.outer(C * ga, C * gb)
+                + f[3] * wp.outer(C * ga, C * gb)
                 - f[1] * wp.skew(F * wp.cross(ga, gb))
             )
     blocks[env, upper[u, 1]] = H
@@ -283,13 +325,26 @@ def block_hessian(
 
 @wp.kernel
 def element_energy_change(
-    y0: VecArray2d, y1: VecArray2d, elements: Elements, active: IntArray, change: FloatArray2d, det: FloatArray2d
+    y0: VecArray2d,
+    y1: VecArray2d,
+    elements: Elements,
+    active: IntArray,
+    # outputs
+    change: FloatArray2d,
+    det: FloatArray2d,
+    det_change: FloatArray2d,
 ):
-    """Ψ(y1) − Ψ(y0) of every element [J], and J at y1; sums of differences keep digits."""
+    """Ψ(y1) − Ψ(y0) of every element [J], J at y1, and its change; sums of differences keep digits.
+
+    What belongs to a volume block is left to the block.
+    """
     env, e = wp.tid()
     if active[env] == 0:
         return
     F0 = deformation(env, e, y0, elements)
     F1 = deformation(env, e, y1, elements)
-    change[env, e] = elements.volume[e] * strain_energy_change(F0, F1, elements.model[e], elements.mu[e], elements.lam[e])
+    if elements.volume_block[e] >= 0:
+        det_change[env, e] = volume_change(F0, F1)
+    psi = strain_energy_change(F0, F1, elements.own[e], elements.model[e], elements.mu[e], elements.lam[e])
+    change[env, e] = elements.volume[e] * psi
     det[env, e] = wp.determinant(F1)

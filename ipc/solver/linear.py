@@ -1,4 +1,4 @@
-"""The Newton matrix H = blocks + Σ q qᵀ: a block matrix of one pattern, and contact rows.
+"""The Newton matrix H = blocks + Σ q qᵀ: a block matrix of one pattern, rows of volume blocks and of contacts.
 
 Products with it, its diagonal, and approximations of its inverse. Everything here can be recorded in a CUDA graph: launches have fixed
 dimensions, counts are read on the device.
@@ -28,6 +28,9 @@ class SystemView:
 
     Block s of row i lies at ``row_base[i] + s·stride``: rows are dealt out in slices of ``stride``, so that threads of neighbouring rows
     read neighbouring blocks (Monakov et al. 2010, sliced ELLPACK); with a stride of 1 the rows lie one after the other.
+
+    Volume block b has a row q: ``volume_row`` (B, S) at the nodes ``pair_node`` from ``block_pair_start[b]`` on. Node i is in the pairs
+    ``node_pair`` from ``node_pair_start[i]`` on. ``volume_motion`` (B, Q) is work space for q·p.
     """
 
     row_base: IntArray
@@ -39,6 +42,13 @@ class SystemView:
     verts: VertexMap
     blocks: MatArray2d
     R: MatArray2d
+    block_pair_start: IntArray
+    pair_block: IntArray
+    pair_node: IntArray
+    node_pair_start: IntArray
+    node_pair: IntArray
+    volume_row: VecArray2d
+    volume_motion: FloatArray2d
 
 
 def slice_rows(row_start: NDArray[np.int32], width: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -60,13 +70,32 @@ def slice_rows(row_start: NDArray[np.int32], width: int) -> tuple[NDArray[np.int
 
 
 @wp.func
+def find_volume_motion(system: SystemView, env: wp.int32, b: wp.int32, p: VecArray2d):
+    """``volume_motion`` = q·p of volume block b, which :func:`block_row` reads."""
+    s = wp.float64(0.0)
+    for k in range(system.block_pair_start[b], system.block_pair_start[b + 1]):
+        s += wp.dot(system.volume_row[env, k], p[env, system.pair_node[k]])
+    system.volume_motion[env, b] = s
+
+
+@wp.kernel
+def find_volume_motions(system: SystemView, p: VecArray2d, active: IntArray):
+    env, b = wp.tid()
+    if active[env] != 0:
+        find_volume_motion(system, env, b, p)
+
+
+@wp.func
 def block_row(system: SystemView, env: wp.int32, i: wp.int32, p: VecArray2d) -> wp.vec3d:
-    """Row i of blocks · p."""
+    """Row i of (blocks + Σ q qᵀ of volume blocks) · p; needs ``volume_motion`` of the same p."""
     f = wp.vec3d()
     k = system.row_base[i]
     for _ in range(system.row_length[i]):
         f += system.blocks[env, k] * p[env, system.col[k]]
         k += system.stride
+    for m in range(system.node_pair_start[i], system.node_pair_start[i + 1]):
+        pair = system.node_pair[m]
+        f += system.volume_motion[env, system.pair_block[pair]] * system.volume_row[env, pair]
     return f
 
 
@@ -74,7 +103,7 @@ def block_row(system: SystemView, env: wp.int32, i: wp.int32, p: VecArray2d) -> 
 def multiply_blocks(
     system: SystemView, p: VecArray2d, active: IntArray, threads: wp.int32, out: VecArray2d, partial: FloatArray2d
 ):
-    """out = blocks p on the unknowns, else 0, and shares of p·out; threads (B, chunks, n)."""
+    """out = (blocks + volume rows) p on the unknowns, else 0, and shares of p·out; (B, chunks, n)."""
     env, c, lane = wp.tid()
     total = wp.float64(0.0)
     if active[env] != 0:
@@ -172,7 +201,7 @@ def push_rows(system: SystemView, contacts: Contacts, dx: VecArray2d, active: In
 
 @wp.kernel
 def push_blocks(system: SystemView, lift: VecArray2d, active: IntArray, residual: VecArray2d):
-    """residual −= blocks · lift on the unknowns, for the prescribed motion of gripped nodes."""
+    """residual −= (blocks + volume rows) · lift on the unknowns: prescribed motion of gripped nodes."""
     env, i = wp.tid()
     if active[env] != 0 and system.free[i] != 0:
         residual[env, i] = residual[env, i] - block_row(system, env, i, lift)
@@ -180,9 +209,15 @@ def push_blocks(system: SystemView, lift: VecArray2d, active: IntArray, residual
 
 @wp.kernel
 def diagonal_blocks(system: SystemView, active: IntArray, out: MatArray2d):
+    """Diagonal blocks of the matrix without contacts."""
     env, i = wp.tid()
-    if active[env] != 0:
-        out[env, i] = system.blocks[env, system.diagonal[i]]
+    if active[env] == 0:
+        return
+    D = system.blocks[env, system.diagonal[i]]
+    for m in range(system.node_pair_start[i], system.node_pair_start[i + 1]):
+        q = system.volume_row[env, system.node_pair[m]]
+        D += wp.outer(q, q)
+    out[env, i] = D
 
 
 @wp.kernel

@@ -17,7 +17,7 @@ import warp as wp
 from ipc.arrays import FloatArray2d, IntArray, VecArray2d
 from ipc.contact.contacts import Contacts
 from ipc.reduce import BLOCK, chunks_of, raise_if_any, total_of
-from ipc.solver.linear import BlockJacobi, Preconditioner, SystemView, multiply_blocks, multiply_rows
+from ipc.solver.linear import BlockJacobi, Preconditioner, SystemView, find_volume_motions, multiply_blocks, multiply_rows
 from ipc.solver.pcg_block import THREADS, Scalars, solve_in_one_block
 
 wp.set_module_options({"enable_backward": False})
@@ -194,6 +194,7 @@ class Pcg:
     ) -> None:
         s, running, z, threads = self.scalars, self._running, self._z, self._threads
         blocks, row_blocks = (*self._rr.shape, threads), (*self._by_rows.shape, threads)
+        volumes = system.volume_motion.shape
 
         def launch(kernel: Any, dim: tuple[int, ...], inputs: list, outputs: list) -> None:
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=BLOCK)
@@ -205,6 +206,8 @@ class Pcg:
         def iterate() -> None:
             for k in range(ROUNDS):
                 parity = k % 2
+                if volumes[1]:
+                    launch(find_volume_motions, volumes, [system, self._p, running], [])
                 launch(multiply_blocks, blocks, [system, self._p, running, threads], [self._Ap, self._by_blocks])
                 inputs = [system, contacts, self._p, running, self.lanes, threads]
                 launch(multiply_rows, row_blocks, inputs, [self._Ap, self._by_rows])

@@ -14,7 +14,7 @@ import warp as wp
 
 from ipc.arrays import FloatArray, FloatArray2d, IntArray, MatArray2d, VecArray2d
 from ipc.contact.contacts import Contacts, rows_of
-from ipc.solver.linear import SystemView, add_row, block_row
+from ipc.solver.linear import SystemView, add_row, block_row, find_volume_motion
 
 wp.set_module_options({"enable_backward": False})
 
@@ -70,6 +70,7 @@ def solve_in_one_block(
     if active[env] == 0:
         return
     n = r.shape[1]
+    volumes = system.volume_motion.shape[1]
     rows = rows_of(contacts, env)
     a = wp.float64(0.0)
     b = wp.float64(0.0)
@@ -89,6 +90,12 @@ def solve_in_one_block(
         return
     wait_for_block()
     for it in range(max_iterations):
+        if volumes > 0:
+            i = lane
+            while i < volumes:
+                find_volume_motion(system, env, i, p)
+                i += threads
+            wait_for_block()
         a = wp.float64(0.0)
         i = lane
         while i < n:

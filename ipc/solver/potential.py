@@ -18,8 +18,8 @@ from ipc.bodies.layout import Layout
 from ipc.contact.collision import Collision
 from ipc.reduce import MAX, MIN, SUM, Reducer
 from ipc.settings import Settings
-from ipc.solver import dynamics, elasticity, frames
-from ipc.solver.linear import SystemView, push_blocks, push_rows, slice_rows
+from ipc.solver import dilation, dynamics, elasticity, frames
+from ipc.solver.linear import SystemView, find_volume_motions, push_blocks, push_rows, slice_rows
 
 _SLICE = 32
 """Rows of the matrix that lie interleaved on CUDA: as many as threads run in step."""
@@ -56,6 +56,8 @@ class Potential:
         self.reduce = Reducer(batch, max(nodes, verts, elements), device)
         self.reduce.prepare(nodes, verts, elements)
         self.elements = filled(elasticity.Elements, device, {name: getattr(layout, name) for name in elasticity.Elements.vars})
+        volumes = {name: getattr(layout, name) for name in dilation.VolumeBlocks.vars}
+        self.volumes = filled(dilation.VolumeBlocks, device, volumes)
         self.node_body, self.node_free = ints(layout.node_body), ints(layout.node_free)
         rows = np.repeat(np.arange(nodes, dtype=np.int64), np.diff(layout.row_start))
         diagonal = np.flatnonzero(rows == layout.col).astype(np.int32)
@@ -92,8 +94,12 @@ class Potential:
         self.y_start, self.y1, self.p, self.lift = (vectors(nodes) for _ in range(4))
         self.gradient, self.residual, self.right_side = (vectors(nodes) for _ in range(3))
         self.xw, self.xw1, self.target, self.local_target, self.local_start = (vectors(nodes) for _ in range(5))
-        self.el_F, self.el_P, self.el_mck = matrices(elements), matrices(elements), vectors(elements)
-        self.el_J, self.el_energy, self.el_change, self.el_J1 = (numbers(batch, elements) for _ in range(4))
+        self.el_F, self.el_P = matrices(elements), matrices(elements)
+        self.el_mckl = wp.zeros((batch, elements), dtype=wp.vec4d, device=device)
+        self.el_J, self.el_energy, self.el_change, self.el_J1, self.el_dJ = (numbers(batch, elements) for _ in range(5))
+        blocks, pairs = len(layout.block_volume), len(layout.pair_node)
+        self.volume_blocks = blocks
+        self.dilation = numbers(batch, blocks)
         self.node_change, self.force_size, self.vert_size = numbers(batch, nodes), numbers(batch, nodes), numbers(batch, verts)
         self.reach, self.barrier, self.elastic_energy, self.kinetic = (numbers() for _ in range(4))
         self.project = wp.zeros(batch, dtype=wp.int32, device=device)
@@ -107,7 +113,10 @@ class Potential:
         mirror = np.searchsorted(rows * nodes + layout.col, layout.col[above].astype(np.int64) * nodes + rows[above])
         self.upper = ints(np.stack([above, self.where[above], self.where[mirror]], axis=1))
         rows_at = {"row_base": base, "row_length": np.diff(layout.row_start)}
+        rows_at |= {name: getattr(layout, name) for name in ("block_pair_start", "pair_block", "pair_node")}
+        rows_at |= {name: getattr(layout, name) for name in ("node_pair_start", "node_pair")}
         self.system = filled(SystemView, device, {**rows_at, "col": columns, "diagonal": self.where[diagonal]})
+        self.system.volume_row, self.system.volume_motion = vectors(pairs), numbers(batch, blocks)
         self.system.stride, self.system.free = width, self.node_free
         self.system.verts = self.verts
         self.system.blocks = matrices(len(columns))
@@ -181,14 +190,20 @@ class Potential:
         lanes = self.collision.lanes
         self.launch(push_rows, (self.batch, lanes), [self.system, contacts, self.dx, mask, lanes], [self.residual])
         if self.grips:
+            if self.volume_blocks:
+                self.launch(find_volume_motions, self.dilation.shape, [self.system, self.lift, mask])
             self.launch(push_blocks, self.y.shape, [self.system, self.lift, mask], [self.residual])
 
     # --- value, gradient, Hessian ----------------------------------------------------------------------------------------------
 
     def evaluate_elements(self, active: wp.array) -> None:
         """F, stress, energy and Hessian factors of the elements at y."""
-        inputs = [self.y, self.elements, active, self.project]
-        outputs = [self.el_F, self.el_P, self.el_mck, self.el_J, self.el_energy]
+        if self.volume_blocks:
+            self.launch(dilation.element_dilation, self.el_J.shape, [self.y, self.elements, active], [self.el_J])
+            inputs = [self.elements, self.volumes, self.el_J, active]
+            self.launch(dilation.mean_dilation, self.dilation.shape, inputs, [self.dilation])
+        inputs = [self.y, self.elements, self.dilation, active, self.project]
+        outputs = [self.el_F, self.el_P, self.el_mckl, self.el_J, self.el_energy]
         self.launch(elasticity.element_state, self.el_J.shape, inputs, outputs)
 
     def touch(self, active: wp.array) -> None:
@@ -210,12 +225,15 @@ class Potential:
         self.launch(dynamics.node_gradient, self.y.shape, inputs, [self.gradient, self.residual, self.force_size])
 
     def fill_matrix(self, active: wp.array) -> None:
-        """The blocks of inertia and elasticity, from results of :meth:`evaluate_elements`."""
+        """Inertia and elasticity, from results of :meth:`evaluate_elements`."""
         inputs = [
             *(self.upper, self.part_start, self.part, self.elements, self.masses, self.inertia_scale),
-            *(self.el_F, self.el_mck, active),
+            *(self.el_F, self.el_mckl, active),
         ]
         self.launch(elasticity.block_hessian, (self.batch, len(self.upper)), inputs, [self.system.blocks])
+        if self.volume_blocks:
+            inputs, row = [self.elements, self.volumes, self.el_F, active], self.system.volume_row
+            self.launch(dilation.dilation_rows, row.shape, inputs, [row])
 
     def try_step(self, alpha: wp.array) -> None:
         """y1 = y + alpha p and its vertices, in the frames as they are."""
@@ -224,8 +242,11 @@ class Potential:
 
     def elastic_change(self, active: wp.array, min_det: wp.array) -> None:
         """Elastic energy change from y to y1, and ``min_det`` (B,) ← min(min_det, det F at y1)."""
-        inputs = [self.y, self.y1, self.elements, active]
-        self.launch(elasticity.element_energy_change, self.el_change.shape, inputs, [self.el_change, self.el_J1])
+        inputs, outputs = [self.y, self.y1, self.elements, active], [self.el_change, self.el_J1, self.el_dJ]
+        self.launch(elasticity.element_energy_change, self.el_change.shape, inputs, outputs)
+        if self.volume_blocks:
+            inputs = [self.elements, self.volumes, self.el_J1, self.el_dJ, active]
+            self.launch(dilation.block_energy_change, self.dilation.shape, inputs, [self.el_change])
         self.reduce(self.el_J1, active, MIN, min_det)
 
     def change(self, active: wp.array, change: wp.array, min_det: wp.array) -> None:

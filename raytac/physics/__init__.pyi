@@ -16,6 +16,7 @@ from .rigid.pad import RigidPad as RigidPad
 from .rigid.search import PadSearch as PadSearch
 from .soft.availability import quiet_solver as quiet_solver
 from .soft.bodies import ScenePad as ScenePad
+from .soft.bodies import pad_body as pad_body
 from .soft.bodies import scene_body as scene_body
 from .soft.contact_width import NarrowContactWarning as NarrowContactWarning
 from .soft.mesh import PAD_LEVELS as PAD_LEVELS

@@ -25,9 +25,9 @@ from tests.markers.pads import BALL, MOTION, pose, pressed
 DEEP = 6e-4
 
 
-@pytest.fixture(scope="module")
-def small(sensor: SensorSpec) -> PadMesh:
-    return pad_mesh(sensor.gelpad, PadLevel(4e-3, 2, 1.5, 1.5, 5e-5))
+@pytest.fixture(scope="module", params=[None, (2, 2, 1)], ids=["elements", "blocks"])
+def small(sensor: SensorSpec, request: pytest.FixtureRequest) -> PadMesh:
+    return pad_mesh(sensor.gelpad, PadLevel(4e-3, 2, 1.5, 1.5, 5e-5, request.param))
 
 
 def test_stiffness_of_a_uniform_strain_is_the_closed_form(sensor: SensorSpec, small: PadMesh) -> None:
@@ -51,7 +51,8 @@ def test_stiffness_of_a_uniform_strain_is_the_closed_form(sensor: SensorSpec, sm
 def test_stiffness_is_that_of_the_solver(sensor: SensorSpec, small: PadMesh) -> None:
     """½ uᵀ K u against the solver's elastic energy of a small displacement."""
     material = pad_body(small, sensor.gelpad).material
-    solver = make_potential(material, small.tets, small.bonded)
+    own = 0.0 if small.volume_blocks is None else small.own_volume
+    solver = make_potential(material, small.tets, small.bonded, small.volume_blocks, own)
     rest = small.tets.vertices
     u = 1e-8 * np.random.default_rng(3).standard_normal(rest.shape)
     u[small.bonded] = 0

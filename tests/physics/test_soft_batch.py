@@ -166,7 +166,7 @@ def test_free_objects_lie_where_their_offsets_put_them():
     pad = soft(press(indent(force=0.3), dynamics="affine"), num_envs=2, offsets=offsets)
     state = pad.peak(pad.run())
     assert not state.failed.any() and state.normal_force == pytest.approx([0.3, 0.3], rel=0.01)
-    assert np.abs(state.surface.contact_centre - offsets).max() < 0.4e-3  # the second rolls a little down the dome
+    assert np.abs(state.surface.contact_centre - offsets).max() < 0.8e-3  # the second rolls a little down the dome
 
 
 def test_where_one_environment_of_a_batch_leaves_the_pad_is_told_before_the_solver_starts():

@@ -44,7 +44,10 @@ def test_a_depth_is_approached_without_passing_it(kind):
     assert (np.diff(depth) > 0.0).all() and (np.diff(force[force > 0.0]) > 0.0).all()
     commanded = 0.5e-3 * np.arange(1, 17) / 16
     touching = force > 1e-3
-    assert touching.sum() >= 15 and np.abs(depth - commanded)[touching].max() < 12e-6
+    off = np.abs(depth - commanded)[touching]
+    assert (
+        touching.sum() >= 15 and off.max() < 25e-6 and np.sort(off)[-2] < 5e-6
+    )  # one state: the first with a clearance to go by
 
 
 def test_a_press_to_a_force_bears_it_and_a_shear_keeps_it():
@@ -100,11 +103,15 @@ def test_a_force_that_grows_is_found_in_few_steps(monkeypatch):
 
 
 def test_friction_is_coulombs():
-    """A flat face dragged until all of it slides; its rim ploughs a little. Without friction, a ball drags next to nothing."""
+    """A flat face dragged until all of it slides: what is not normal to the contacts is μ times what is. A ball without friction."""
     sensor = replace(SENSOR, gelpad=replace(SENSOR.gelpad, friction=0.2))
     pad = uncorrected(press(indent(0.4e-3), StageSpec("shear", shear=(0.6e-3, 0.0)), kind="cylinder"), sensor)
     state = pad.peak(pad.run())
-    assert state.shear_force[0, 0] == pytest.approx(0.2 * state.normal_force[0], rel=0.1)
+    assert pad.solver is not None
+    world = pad.solver.world
+    (pair,) = world.pressing().values()  # the rim ploughs: its normals are not upright
+    assert np.linalg.norm(pair.wrench[0, :3] - pair.normal[0]) == pytest.approx(0.2 * world.contacts().force.sum(), rel=0.1)
+    assert 0.5 * 0.2 < state.shear_force[0, 0] / state.normal_force[0] < 1.5 * 0.2
     pad = uncorrected(press(indent(0.5e-3), StageSpec("shear", shear=(0.2e-3, 0.0))), FRICTIONLESS)
     state = pad.peak(pad.run())
     assert abs(state.shear_force[0, 0]) < 0.05 * state.normal_force[0]  # facets of a millimetre plough

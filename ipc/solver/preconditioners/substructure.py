@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipc.bodies.layout import Layout
-from ipc.solver.preconditioners.rest_stiffness import Floats, Ints, dense_block, free_nodes
+from ipc.solver.preconditioners.rest_stiffness import Floats, Ints, couplings, dense_block, free_nodes
 
 Singles = NDArray[np.float32]
 
@@ -49,7 +49,7 @@ class Substructure:
 
 def _neighbours(layout: Layout, label: Ints) -> tuple[Ints, Ints]:
     """Pairs of nodes that a block of the matrix couples, both with a non-negative label."""
-    rows, cols = np.repeat(np.arange(len(layout.node_rest)), np.diff(layout.row_start)), layout.col
+    rows, cols = couplings(layout)
     keep = (label[rows] >= 0) & (label[cols] >= 0)
     return rows[keep], cols[keep]
 
@@ -95,7 +95,7 @@ def condense(layout: Layout, blocks: Floats, nodes: Ints, label: Ints) -> Substr
     """The substructure of the matrix between ``nodes``, all others fixed.
 
     Args:
-        layout, blocks: the matrix (K, 3, 3) in the layout's pattern.
+        layout, blocks: the matrix (K', 3, 3) between the layout's ``couplings``.
         nodes: of one body.
         label: patch of every node of the layout, −1 for the interface.
 
@@ -106,11 +106,11 @@ def condense(layout: Layout, blocks: Floats, nodes: Ints, label: Ints) -> Substr
     place = np.full(len(layout.node_rest), -1)
     place[interface] = np.arange(len(interface))
     schur = dense_block(layout, blocks, interface, interface)
-    coupled = np.repeat(np.arange(len(layout.node_rest)), np.diff(layout.row_start))
+    coupled, others = couplings(layout)
     patches = []
     for part in np.unique(label[nodes][label[nodes] >= 0]):
         inside = nodes[label[nodes] == part]
-        border = np.unique(layout.col[np.isin(coupled, inside)])
+        border = np.unique(others[np.isin(coupled, inside)])
         border = border[place[border] >= 0]
         inverse = np.linalg.inv(dense_block(layout, blocks, inside, inside))
         coupling = dense_block(layout, blocks, inside, border)
@@ -125,7 +125,8 @@ def entries(layout: Layout, nodes: Ints, label: Ints) -> int:
     """Entries of the inverse in this form, patches padded to the largest."""
     interface = 3 * int((label[nodes] < 0).sum())
     inner = 3 * np.bincount(label[label >= 0], minlength=1)
-    rows, cols = np.repeat(label, np.diff(layout.row_start)), layout.col
+    rows, cols = couplings(layout)
+    rows = label[rows]
     free = np.zeros(len(label), bool)
     free[nodes] = True
     touch = (rows >= 0) & (label[cols] < 0) & free[cols]

@@ -63,7 +63,8 @@ class SceneBody:
 def pad_body(mesh: PadMesh, gelpad: GelpadSpec, name: str = PAD) -> ipc.SoftBody:
     """The gel of a pad: stable neo-Hookean, fixed where bonded, with self-contact."""
     material = ipc.Material(young=gelpad.youngs_modulus, poisson=gelpad.poisson_ratio, density=gelpad.density)
-    return ipc.SoftBody(name, mesh.tets, material, bonded=mesh.bonded, self_contact=True)
+    blocks = {} if mesh.volume_blocks is None else {"volume_blocks": mesh.volume_blocks, "own_volume": mesh.own_volume}
+    return ipc.SoftBody(name, mesh.tets, material, bonded=mesh.bonded, self_contact=True, **blocks)
 
 
 def scene_body(

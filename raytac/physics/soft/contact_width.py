@@ -53,12 +53,12 @@ def warn_if_narrow(cells: np.ndarray, level: object, *, stacklevel: int) -> bool
     if not least < LEAST_CELLS:
         return False
     level = level if isinstance(level, str) else "own"
-    finer = PADS[PADS.index(level) + 1 : PADS.index(level) + 2] if level in PADS else ()
+    finer = PADS[-1:] if level in PADS[:-1] else ()  # medium, without volume blocks, is stiffer than coarse
     remedy = f"choose level={finer[0]!r}" if finer else "no level is finer: give a finer mesh of your own as level"
     where = f" in environment {int(np.nanargmin(cells))}" if len(cells) > 1 else ""
     warnings.warn(
         f"level = {level!r}: the contact{where} is {least:.1f} cells across; for a force or traction to be trusted it must be at least "
-        f"{LEAST_CELLS:g}, three to its radius, and with fewer they are too large at a given depth: {remedy}, or press to a force",
+        f"{LEAST_CELLS:g}, three to its radius, and with fewer they may be off at a given depth: {remedy}, or press to a force",
         NarrowContactWarning,
         stacklevel=stacklevel + 1,
     )

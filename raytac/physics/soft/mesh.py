@@ -25,10 +25,14 @@ class PadLevel:
     """Height of the lowest layer over that of the uppermost."""
     d_hat: float
     """Distance below which object and coat repel [m]."""
+    block: tuple[int, int, int] | None = None
+    """Cells along x, y and z that share their change of volume; None: each tetrahedron has its own."""
+    own_volume: float = 0.25
+    """Stiffness of a tetrahedron of a block against a change of its own volume, in μ; steadies the solver."""
 
 
 PAD_LEVELS = {
-    "coarse": PadLevel(1.6e-3, 3, 2.5, 2.0, 5e-5),
+    "coarse": PadLevel(1.6e-3, 3, 6.0, 3.0, 5e-5, (2, 2, 1)),
     "medium": PadLevel(0.85e-3, 5, 2.5, 2.5, 3e-5),
     "fine": PadLevel(0.5e-3, 8, 2.5, 3.0, 1.5e-5),
 }
@@ -47,6 +51,10 @@ class PadMesh:
     """Numbers of the vertices of ``tets`` that are fixed to the case."""
     d_hat: float
     """Distance below which object and coat repel [m]."""
+    volume_blocks: np.ndarray | None = None
+    """Volume block of each tetrahedron, shape (T,), as of ``ipc.SoftBody``; None: no blocks."""
+    own_volume: float = 0.25
+    """As of ``ipc.SoftBody``; without blocks it has no effect."""
 
     def __post_init__(self) -> None:
         if len(self.bonded) == 0:
@@ -85,7 +93,8 @@ def pad_mesh(gelpad: GelpadSpec, level: str | PadLevel | PadMesh) -> PadMesh:
     at_side = (np.abs(vertices[:, :2]) >= 0.5 * np.asarray(gelpad.size) * (1.0 - 1e-12)).any(axis=1)
     bonded = np.flatnonzero(at_back | at_side if gelpad.bonded == "back_and_sides" else at_back)
     coat = CoatMesh(vertices[coat_vertices], _coat_faces(tets.tets, coat_vertices[0], vertices), x, y)
-    return PadMesh(ipc.TetMesh(vertices, tets.tets), coat, coat_vertices, bonded, level.d_hat)
+    blocks = level.block and ipc.grid_blocks((len(x) - 1, len(y) - 1, level.layers), level.block)
+    return PadMesh(ipc.TetMesh(vertices, tets.tets), coat, coat_vertices, bonded, level.d_hat, blocks, level.own_volume)
 
 
 def _lines(size: float, level: PadLevel) -> np.ndarray:

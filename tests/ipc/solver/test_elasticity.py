@@ -18,9 +18,16 @@ Model = Literal["stable", "stable_log"]
 MODELS: list[Model] = ["stable", "stable_log"]
 
 
-def make_potential(material: ipc.Material, mesh: ipc.TetMesh | None = None, bonded: np.ndarray | None = None) -> Potential:
+def make_potential(
+    material: ipc.Material,
+    mesh: ipc.TetMesh | None = None,
+    bonded: np.ndarray | None = None,
+    blocks: np.ndarray | None = None,
+    own_volume: float = 0.0,
+) -> Potential:
     """A solver of one cube of soft material, statics only."""
-    body = ipc.SoftBody("cube", mesh or unit_cell(1), material, bonded=np.zeros(0, int) if bonded is None else bonded)
+    held = np.zeros(0, int) if bonded is None else bonded
+    body = ipc.SoftBody("cube", mesh or unit_cell(1), material, bonded=held, volume_blocks=blocks, own_volume=own_volume)
     layout = build_layout([body], 0.0, {}, [])
     statics = ipc.Settings(dt=np.inf)  # no inertia
     solver = Potential(layout, statics, 1, 0.01, 1.0, wp.get_device("cpu"))
@@ -31,12 +38,22 @@ def make_potential(material: ipc.Material, mesh: ipc.TetMesh | None = None, bond
 
 
 def dense(solver: Potential) -> np.ndarray:
-    """The assembled block matrix as a dense one, (3N, 3N)."""
+    """The assembled matrix, with the rows of volume blocks, as a dense one (3N, 3N)."""
     n, layout = solver.y.shape[1], solver.layout
     out = np.zeros((n, n, 3, 3))
     rows = np.repeat(np.arange(n), np.diff(layout.row_start))
     out[rows, layout.col] = solver.system.blocks.numpy()[0, solver.where]
+    q = volume_rows(solver)
+    out += np.einsum("bia,bjc->ijac", q, q)
     return out.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
+
+
+def volume_rows(solver: Potential) -> np.ndarray:
+    """q of every volume block at every node, (Q, N, 3)."""
+    layout = solver.layout
+    q = np.zeros((len(layout.block_volume), solver.y.shape[1], 3))
+    q[layout.pair_block, layout.pair_node] = solver.system.volume_row.numpy()[0]
+    return q
 
 
 def gradient_at(solver: Potential, y: np.ndarray, project: bool = False) -> np.ndarray:
@@ -82,10 +99,10 @@ def test_projected_hessian_is_definite_and_close(model: Model, rng: np.random.Ge
         y = (solver.layout.node_rest + scale * rng.standard_normal(solver.layout.node_rest.shape)) * [1, 1, height]
         gradient_at(solver, y)
         solver.fill_matrix(solver.everyone)
-        exact, c = dense(solver), solver.el_mck.numpy()[0, :, 1].copy()
+        exact, c = dense(solver), solver.el_mckl.numpy()[0, :, 1].copy()
         gradient_at(solver, y, project=True)
         solver.fill_matrix(solver.everyone)
-        projected, reduced = dense(solver), solver.el_mck.numpy()[0, :, 1].copy()
+        projected, reduced = dense(solver), solver.el_mckl.numpy()[0, :, 1].copy()
         top = np.linalg.eigvalsh(projected)[-1]
         assert np.linalg.eigvalsh(projected)[0] > -1e-12 * top
         indefinite += np.linalg.eigvalsh(exact)[0] < -1e-9 * top

@@ -55,6 +55,10 @@ class Problem:
         for name, values in (
             *(("row_base", layout.row_start[:-1]), ("row_length", np.diff(layout.row_start)), ("col", layout.col)),
             *(("diagonal", np.flatnonzero(rows_of == layout.col)), ("free", layout.node_free)),
+            *(
+                (name, getattr(layout, name))
+                for name in ("block_pair_start", "pair_block", "pair_node", "node_pair_start", "node_pair")
+            ),
         ):
             setattr(s, name, self._array(values, wp.int32))
         s.stride = 1

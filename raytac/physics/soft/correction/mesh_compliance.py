@@ -62,6 +62,8 @@ def rest_stiffness(mesh: PadMesh, gelpad: GelpadSpec) -> _Sparse:
     """Stiffness of all vertices [N/m], (3n, 3n), unknown 3 v + axis, by linear elasticity.
 
     A tetrahedron of volume V whose shape functions have gradients g adds V (λ g_a g_bᵀ + μ g_b g_aᵀ + μ (g_a · g_b) 1) to block (a, b).
+    In a volume block b its λ is λ' − μ, and the block adds (λ + μ − λ')/V_b q qᵀ with q = Σ V g: the coefficient of (J − 1)² in the
+    solver's energy is λ + μ, of which the tetrahedron keeps λ' = ``own_volume`` μ (``ipc.solver.dilation``).
     """
     vertices, tets = mesh.tets.vertices, mesh.tets.tets
     young, nu = gelpad.youngs_modulus, gelpad.poisson_ratio
@@ -71,27 +73,51 @@ def rest_stiffness(mesh: PadMesh, gelpad: GelpadSpec) -> _Sparse:
     inverse = np.linalg.inv(edges)
     slope = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)  # of the four hat functions, (T, 4, 3)
     outer = slope[:, :, None, :, None] * slope[:, None, :, None, :]
-    block = lame * outer + shear * np.swapaxes(outer, 3, 4)
+    volume = np.abs(np.linalg.det(edges)) / 6.0
+    own = np.full(len(tets), lame)
+    if mesh.volume_blocks is not None:
+        own[mesh.volume_blocks >= 0] = (mesh.own_volume - 1.0) * shear
+    block = own[:, None, None, None, None] * outer + shear * np.swapaxes(outer, 3, 4)
     block += shear * np.einsum("tac,tbc->tab", slope, slope)[..., None, None] * np.eye(3)
-    block *= (np.abs(np.linalg.det(edges)) / 6.0)[:, None, None, None, None]
+    block *= volume[:, None, None, None, None]
     n = len(vertices)
     pair, back = np.unique(tets[:, :, None].astype(np.int64) * n + tets[:, None, :], return_inverse=True)
     entry = (9 * back.reshape(len(tets), 4, 4, 1, 1) + np.arange(9).reshape(3, 3)).ravel()
     row, column = 3 * (pair // n)[:, None, None] + np.arange(3)[:, None], 3 * (pair % n)[:, None, None] + np.arange(3)
     row, column = (np.broadcast_to(x, (len(pair), 3, 3)).ravel() for x in (row, column))
     value = np.bincount(entry, block.ravel(), 9 * len(pair))
+    rows, columns, values = [row], [column], [value]
+    for inside in _volume_blocks(mesh):
+        unknown, where = np.unique(3 * tets[inside][:, :, None] + np.arange(3), return_inverse=True)
+        total = np.bincount(where.ravel(), (volume[inside, None, None] * slope[inside]).ravel())
+        rows.append(np.repeat(unknown, len(unknown)))
+        columns.append(np.tile(unknown, len(unknown)))
+        values.append(((lame + shear - mesh.own_volume * shear) / volume[inside].sum() * total[:, None] * total).ravel())
+    row, column, value = (np.concatenate(parts) for parts in (rows, columns, values))
     order = np.argsort(row * 3 * n + column, kind="stable")
     return _Sparse(row[order], column[order], value[order], (3 * n, 3 * n))
 
 
+def _volume_blocks(mesh: PadMesh) -> list[np.ndarray]:
+    """Tetrahedra of each volume block."""
+    if mesh.volume_blocks is None:
+        return []
+    order = np.argsort(mesh.volume_blocks, kind="stable")
+    blocks = np.split(order, np.flatnonzero(np.diff(mesh.volume_blocks[order])) + 1)
+    return [block for block in blocks if mesh.volume_blocks[block[0]] >= 0]
+
+
 def _layers(mesh: PadMesh) -> np.ndarray:
-    """Number of edges between each vertex and the coat, shape (n,)."""
+    """Number of edges, or volume blocks, between each vertex and the coat, shape (n,)."""
     tets = mesh.tets.tets
     layer = np.full(len(mesh.tets.vertices), -1)
     layer[mesh.coat_vertices] = 0
     depth = 0
     while (layer < 0).any():
-        touched = np.unique(tets[(layer[tets] == depth).any(axis=1)])
+        near = (layer[tets] == depth).any(axis=1)
+        if mesh.volume_blocks is not None:
+            near |= np.isin(mesh.volume_blocks, mesh.volume_blocks[near & (mesh.volume_blocks >= 0)])
+        touched = np.unique(tets[near])
         new = touched[layer[touched] < 0]
         if len(new) == 0:
             break
