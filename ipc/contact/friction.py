@@ -1,12 +1,27 @@
-"""Lagged Coulomb friction (Li et al. 2020, section 5).
+"""Coulomb friction with an elastic slip that contacts remember.
 
-With the normal force λ, the normal n and the closest points c_i of an earlier iterate held fixed, a pair stores μ λ f0(‖u‖), where
-u = (1 − n nᵀ) Σ c_i (x_i − x_i^start) is its sliding since the start of the step and ε = ε_v h:
+A pair of primitives has an anchor and an elastic slip w: the tangential displacement of the closest points since the anchor. Its
+tangential force is μ λ f1(‖w‖) ŵ, with the normal force λ, the normal n and the closest points c_i of an earlier iterate held fixed
+(lagged; Li et al. 2020, section 5) and their mollifier as the law of a spring that yields at ‖w‖ = ε:
 
+    w = z + (1 − n nᵀ) Σ c_i (x_i − x_i^start),    E = μ λ f0(‖w‖),
     f0(y) = y²/ε − y³/(3 ε²) + ε/3 for y < ε, else y;    f1 = f0' = 2y/ε − y²/ε² or 1.
 
-The Hessian μ λ [(f1/y)(1 − û ûᵀ) + f1' û ûᵀ] has no negative eigenvalue: two rows, along û and across it. Below the threshold a pair
-under the tangential load r μ λ creeps at ε_v (1 − √(1 − r)).
+z is the elastic slip at the start of the step. At its end the return mapping z ← w min(1, ε/‖w‖) moves the anchor of the pairs that slip,
+and of no others. This is plasticity with the yield surface ‖force‖ = μ λ (Simo, Laursen 1992, "An augmented Lagrangian treatment of
+contact problems involving friction", section 3); that E is linear beyond ε makes its gradient that mapping's force. While nothing
+moves, nothing is forgotten, in any number of steps. The Hessian μ λ [(f1/y)(1 − ŵ ŵᵀ) + f1' ŵ ŵᵀ] has no negative eigenvalue: two rows,
+along ŵ and across it.
+
+*What remembers.* Pairs do, known by their vertices: point and triangle, two edges, point and plane. Pairs within d̂ come and go with the
+barrier's force, so a new one begins with no slip and hardly a force, and one that has left is forgotten. Slip kept at vertices would have
+to be averaged from the pairs and back in each step, which smooths the tractions away; pairs keep it to the last bit. Where a contact
+slides or rolls on to other primitives, what is lost is at most a slip of ε. Pairs are found by a hash of their vertices. Where two slots
+of it collide, the lowest index wins, so nothing depends on scheduling.
+
+*Frames.* z turns with the triangle that the pair's second side belongs to (or with the plane), so that bodies which turn together keep
+their stress. The same turn moves the closest points apart by (Q − 1) Σ c_i x_i^start without any slip, since they are a gap from each
+other, and is taken off.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -16,7 +31,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, VecArray2d
+from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, MatArray2d, QuatArray2d, VecArray2d
 from ipc.contact.contacts import Contacts, push_row
 
 wp.set_module_options({"enable_backward": False})
@@ -24,14 +39,53 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Lagged:
-    """The pairs whose normal force is held fixed; ``limit`` is μ λ [N]."""
+    """The pairs whose normal force is held fixed.
+
+    ``limit`` is μ λ [N], ``slip`` the part of w that the step does not change [m], and ``turn`` Q, from the start of the step to the lag.
+    """
 
     verts: wp.array2d(dtype=wp.vec4i)
     coef: wp.array2d(dtype=wp.vec4d)
     normal: VecArray2d
     limit: FloatArray2d
     pair: IntArray2d
+    slip: VecArray2d
+    turn: MatArray2d
     count: IntArray
+
+
+@wp.struct
+class Memory:
+    """Elastic slips z [m] at the start of the step, world frame, by pair."""
+
+    verts: wp.array2d(dtype=wp.vec4i)
+    pair: IntArray2d
+    slip: VecArray2d
+    count: IntArray
+
+
+@wp.struct
+class Index:
+    """A hash of pairs by their vertices: the first entry of each slot and the next of each entry, −1 for none."""
+
+    first: IntArray2d
+    next: IntArray2d
+
+
+@wp.struct
+class Turning:
+    """Where the material of the pairs' second sides was at the start of the step, to tell how far it turned.
+
+    Attributes:
+        x: vertices at the start [m] (B, V).    frame_q: frames at the start (B, frames).
+        faces: (F, 3).    vert_face: a face of each vertex (V,).    plane: second body of each body pair (P,).
+    """
+
+    x: VecArray2d
+    frame_q: QuatArray2d
+    faces: IntArray2d
+    vert_face: IntArray
+    plane: IntArray
 
 
 @wp.func
@@ -68,9 +122,88 @@ def sliding(x: VecArray2d, start: VecArray2d, env: wp.int32, verts: wp.vec4i, c:
     return u - wp.dot(u, n) * n
 
 
+@wp.func
+def face_frame(x: VecArray2d, faces: IntArray2d, env: wp.int32, face: wp.int32) -> wp.mat33d:
+    """Orthonormal axes of a triangle, as columns."""
+    a = x[env, faces[face, 0]]
+    along, side = wp.normalize(x[env, faces[face, 1]] - a), x[env, faces[face, 2]] - a
+    n = wp.normalize(wp.cross(along, side))
+    return wp.matrix_from_cols(along, wp.cross(n, along), n)
+
+
+@wp.func
+def turn_of(turning: Turning, x: VecArray2d, R: MatArray2d, env: wp.int32, verts: wp.vec4i, pair: wp.int32) -> wp.mat33d:
+    """Q, the rotation of the pair's second side from the start of the step to x and R."""
+    if verts[1] < 0:
+        body = turning.plane[pair]
+        return R[env, body] * wp.transpose(wp.quat_to_matrix(turning.frame_q[env, body]))
+    face = turning.vert_face[verts[3]]
+    return face_frame(x, turning.faces, env, face) * wp.transpose(face_frame(turning.x, turning.faces, env, face))
+
+
+@wp.func
+def apart(x: VecArray2d, env: wp.int32, verts: wp.vec4i, c: wp.vec4d) -> wp.vec3d:
+    """Σ c_i x_i [m] of a pair of primitives, which a turn changes; zero of a point and a plane."""
+    t = wp.vec3d()
+    if verts[1] >= 0:
+        for i in range(1, 4):
+            t += c[i] * (x[env, verts[i]] - x[env, verts[0]])
+    return t
+
+
+@wp.func
+def in_tangent_plane(z: wp.vec3d, n: wp.vec3d) -> wp.vec3d:
+    """z turned into the plane across n; its length is kept."""
+    flat = z - wp.dot(z, n) * n
+    length = wp.length(flat)
+    if length > wp.float64(0.0):
+        return (wp.length(z) / length) * flat
+    return flat
+
+
+@wp.func
+def slot_of(verts: wp.vec4i, slots: wp.int32) -> wp.int32:
+    """Slot of a pair in the hash."""
+    key = wp.uint32(0)
+    for k in range(4):
+        key = wp.uint32(1000003) * key + wp.uint32(verts[k])
+    return wp.int32(key % wp.uint32(slots))
+
+
+@wp.func
+def find_pair(
+    index: Index, verts: wp.array2d(dtype=wp.vec4i), pairs: IntArray2d, env: wp.int32, v: wp.vec4i, pair: wp.int32
+) -> wp.int32:
+    """Entry of a pair, −1 without one. Two edges of a body may have the vertices of a point and a triangle; the lowest entry counts."""
+    found = wp.int32(-1)
+    k = index.first[env, slot_of(v, index.first.shape[1])]
+    while k >= 0:
+        u = verts[env, k]
+        if u[0] == v[0] and u[1] == v[1] and u[2] == v[2] and u[3] == v[3] and pairs[env, k] == pair:
+            if found < 0 or k < found:
+                found = k
+        k = index.next[env, k]
+    return found
+
+
+@wp.kernel
+def clear_index(active: IntArray, index: Index):
+    env, i = wp.tid()
+    if active[env] != 0:
+        index.first[env, i] = -1
+
+
+@wp.kernel
+def fill_index(verts: wp.array2d(dtype=wp.vec4i), count: IntArray, active: IntArray, index: Index):
+    """Enters all pairs into the hash."""
+    env, i = wp.tid()
+    if active[env] != 0 and i < count[env]:
+        index.next[env, i] = wp.atomic_exch(index.first, env, slot_of(verts[env, i], index.first.shape[1]), i)
+
+
 @wp.kernel
 def keep_lagged(lagged: Lagged, active: IntArray, out: Lagged):
-    """Copies the lagged pairs of the active environments."""
+    """Copies the limits of the active environments and where they act."""
     env, i = wp.tid()
     if active[env] == 0:
         return
@@ -84,19 +217,77 @@ def keep_lagged(lagged: Lagged, active: IntArray, out: Lagged):
 
 
 @wp.kernel
-def lag_contacts(contacts: Contacts, mu: FloatArray, active: IntArray, out: Lagged):
-    """Freezes the contacts of the active environments."""
+def lag_contacts(
+    x: VecArray2d,
+    R: MatArray2d,
+    turning: Turning,
+    contacts: Contacts,
+    memory: Memory,
+    index: Index,
+    mu: FloatArray,
+    active: IntArray,
+    # outputs
+    out: Lagged,
+):
+    """Freezes the contacts of the active environments, with what they remember."""
     env, i = wp.tid()
     if active[env] == 0:
         return
     if i == 0:
         out.count[env] = wp.min(contacts.count[env], contacts.force.shape[1])
     if i < contacts.count[env]:
-        out.verts[env, i] = contacts.verts[env, i]
-        out.coef[env, i] = contacts.coef[env, i]
-        out.normal[env, i] = contacts.normal[env, i]
-        out.limit[env, i] = mu[contacts.pair[env, i]] * contacts.force[env, i]
-        out.pair[env, i] = contacts.pair[env, i]
+        verts, coef, n, pair = contacts.verts[env, i], contacts.coef[env, i], contacts.normal[env, i], contacts.pair[env, i]
+        turn = turn_of(turning, x, R, env, verts, pair)
+        arm = apart(turning.x, env, verts, coef)
+        moved = turn * arm - arm
+        slip = wp.dot(moved, n) * n - moved
+        entry = find_pair(index, memory.verts, memory.pair, env, verts, pair)
+        if entry >= 0:
+            slip += in_tangent_plane(turn * memory.slip[env, entry], n)
+        out.verts[env, i] = verts
+        out.coef[env, i] = coef
+        out.normal[env, i] = n
+        out.limit[env, i] = mu[pair] * contacts.force[env, i]
+        out.pair[env, i] = pair
+        out.slip[env, i] = slip
+        out.turn[env, i] = turn
+
+
+@wp.kernel
+def remember(
+    x: VecArray2d,
+    R: MatArray2d,
+    turning: Turning,
+    contacts: Contacts,
+    lagged: Lagged,
+    index: Index,
+    eps: wp.float64,
+    active: IntArray,
+    # outputs
+    memory: Memory,
+):
+    """Elastic slips of the contacts at the end x of the step, by return mapping; zero of a pair that had no friction in it."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    if i == 0:
+        memory.count[env] = wp.min(contacts.count[env], contacts.force.shape[1])
+    if i < contacts.count[env]:
+        verts, pair = contacts.verts[env, i], contacts.pair[env, i]
+        entry, z = find_pair(index, lagged.verts, lagged.pair, env, verts, pair), wp.vec3d()
+        if entry >= 0:
+            c, n = lagged.coef[env, entry], lagged.normal[env, entry]
+            turn = turn_of(turning, x, R, env, verts, pair)
+            arm = apart(turning.x, env, verts, c)
+            moved = turn * arm - lagged.turn[env, entry] * arm
+            w = lagged.slip[env, entry] + sliding(x, turning.x, env, verts, c, n) - (moved - wp.dot(moved, n) * n)
+            y = wp.length(w)
+            if y > eps:
+                w = (eps / y) * w
+            z = in_tangent_plane(turn * (wp.transpose(lagged.turn[env, entry]) * w), contacts.normal[env, i])
+        memory.verts[env, i] = verts
+        memory.pair[env, i] = pair
+        memory.slip[env, i] = z
 
 
 @wp.kernel
@@ -120,7 +311,7 @@ def friction_rows(
         if limit <= wp.float64(0.0):
             continue
         verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
-        u = sliding(x, start, env, verts, c, n)
+        u = lagged.slip[env, i] + sliding(x, start, env, verts, c, n)
         y = wp.length(u)
         ratio = friction_slope_ratio(y, eps)
         for k in range(4):
@@ -159,8 +350,8 @@ def friction_change(
         return
     for i in range(lane, wp.min(lagged.count[env], lagged.limit.shape[1]), lanes):
         verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
-        y0 = wp.length(sliding(x0, start, env, verts, c, n))
-        y1 = wp.length(sliding(x1, start, env, verts, c, n))
+        y0 = wp.length(lagged.slip[env, i] + sliding(x0, start, env, verts, c, n))
+        y1 = wp.length(lagged.slip[env, i] + sliding(x1, start, env, verts, c, n))
         wp.atomic_add(change, env, lagged.limit[env, i] * (friction_potential(y1, eps) - friction_potential(y0, eps)))
 
 

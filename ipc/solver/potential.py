@@ -96,6 +96,7 @@ class Potential:
         self.el_J, self.el_energy, self.el_change, self.el_J1 = (numbers(batch, elements) for _ in range(4))
         self.node_change, self.force_size, self.vert_size = numbers(batch, nodes), numbers(batch, nodes), numbers(batch, verts)
         self.reach, self.barrier, self.elastic_energy, self.kinetic = (numbers() for _ in range(4))
+        self.collision.begin_step(self.x_start, self.frame_q)
         self.project = wp.zeros(batch, dtype=wp.int32, device=device)
         self.everyone = wp.full(batch, 1, dtype=wp.int32, device=device)
 
@@ -121,11 +122,6 @@ class Potential:
     def inertia_scale(self) -> float:
         """1/h² [1/s²]."""
         return 1.0 / (self.dt * self.dt)
-
-    @property
-    def friction_eps(self) -> float:
-        """ε = ε_v h [m]."""
-        return self.settings.friction_velocity * self.dt
 
     def set_dt(self, dt: float) -> None:
         """Let the next steps be ``dt`` [s] long."""
@@ -194,7 +190,7 @@ class Potential:
     def touch(self, active: wp.array) -> None:
         """Contacts, their forces and rows at x."""
         self.collision.assemble(
-            *(self.x, self.x_start, self.R, self.t, self.kappa, self.friction_eps, active, self.vert_gradient, self.barrier)
+            *(self.x, self.x_start, self.R, self.t, self.kappa, self.settings.friction_slip, active, self.vert_gradient, self.barrier)
         )
 
     def assemble(self, active: wp.array) -> None:
@@ -237,7 +233,7 @@ class Potential:
         self.launch(dynamics.inertia_change, self.y.shape, inputs, [self.node_change])
         self.reduce(self.node_change, active, SUM, change)
         self.collision.energy_change(
-            *(self.x, self.x1, self.x_start, self.R, self.t, self.kappa, self.friction_eps, active, change)
+            *(self.x, self.x1, self.x_start, self.R, self.t, self.kappa, self.settings.friction_slip, active, change)
         )
 
     def slope(self, active: wp.array, slope: wp.array, noise: wp.array) -> None:

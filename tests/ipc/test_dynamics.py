@@ -29,7 +29,7 @@ def block_on_slope(mu: float, kind: str, theta: float = THETA, dt: float = 0.01)
         d_hat=1e-3,
         kappa=1e5,
         friction=mu,
-        friction_velocity=1e-4,
+        friction_slip=1e-6,
         velocity_tolerance=1e-8,
         friction_relags=20,
         friction_tolerance=1e-6,

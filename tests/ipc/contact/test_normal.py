@@ -29,7 +29,7 @@ class Scene:
         v[:, 2] += 1.0 + gap - v[:, 2].min()
         bodies = [ipc.SoftBody("a", a, ipc.Material(1e5)), ipc.SoftBody("b", ipc.TetMesh(v, b.tets), ipc.Material(1e5))]
         self.layout = build_layout(bodies, friction, {}, [])
-        settings = ipc.Settings(dt=1.0, friction_velocity=EPS)
+        settings = ipc.Settings(dt=1.0, friction_slip=EPS)
         self.solver = Potential(self.layout, settings, 1, D_HAT, KAPPA, wp.get_device("cpu"))
         self.solver.y.assign(self.layout.node_rest[None])
         self.solver.frame_q.fill_(wp.quatd(0.0, 0.0, 0.0, 1.0))
@@ -181,7 +181,7 @@ def test_gradient_matches_finite_differences_near_parallel_edges(rng: np.random.
 def test_friction_matches_ipctk(slide: float, rng: np.random.Generator) -> None:
     scene = Scene(0.02, TILTS["corner"], friction=MU)
     scene.evaluate(scene.x)
-    scene.solver.collision.lag(scene.solver.everyone, scene.solver.reach)
+    scene.solver.collision.lag(scene.solver.x, scene.solver.R, scene.solver.everyone, scene.solver.reach)
     _, normal = scene.evaluate(scene.x)
     moved = scene.x.copy()
     moved[scene.x[:, 2] > 1.001] += slide * np.array([0.6, 0.8, 0.1])
@@ -207,7 +207,7 @@ def barrier_gradient(x: np.ndarray) -> np.ndarray:
 def test_friction_hessian_matches_finite_differences(rng: np.random.Generator) -> None:
     scene = Scene(0.02, TILTS["corner"], friction=MU)
     scene.evaluate(scene.x)
-    scene.solver.collision.lag(scene.solver.everyone, scene.solver.reach)
+    scene.solver.collision.lag(scene.solver.x, scene.solver.R, scene.solver.everyone, scene.solver.reach)
     far = scene.x.copy()
     far[scene.x[:, 2] > 1.001] += [0.4 * EPS, 0.1 * EPS, 0.0]
     bare = Scene(0.02, TILTS["corner"])
