@@ -23,8 +23,9 @@ class Settings:
         friction: default coefficient μ [-] of every pair of bodies (``World`` takes exceptions by name).
         friction_slip: ε [m]; the elastic slip at which a contact yields: friction grows smoothly from zero to its limit over this way,
             and is remembered. Contacts are softer to shear by 2μλ/ε in series, so ε is to be small against the motions of interest.
-        friction_relags: number of times that a step may renew the lagged normal forces and tangents after its first solve.
-        friction_tolerance: a step renews them until the friction force changed by less than this fraction [-].
+        friction_relags: number of times that a step may renew the normal forces and tangents that bound friction after its first solve;
+            a step that still changes them then has not converged. 0: they are those at the start of the step, unchecked.
+        friction_tolerance: a step renews them until they change by less than this fraction [-].
         linear_tolerance: relative residual ‖r‖/‖g‖ of the linear solve [-].
         max_linear: PCG iterations a solve.
         preconditioner: of PCG: ``"block_jacobi"``, ``"rest_inverse"`` (bonded bodies' rest matrix inverted once, contacts as a low-rank
@@ -54,7 +55,7 @@ class Settings:
     kappa: float | None = None
     friction: float = 0.0
     friction_slip: float = 1e-6
-    friction_relags: int = 2
+    friction_relags: int = 30
     friction_tolerance: float = 0.01
     linear_tolerance: float = 1e-2
     max_linear: int = 2000

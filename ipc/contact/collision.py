@@ -117,6 +117,7 @@ class Collision:
         self.lagged, self._old, self.memory = friction.Lagged(), friction.Lagged(), friction.Memory()
         for pairs in (self.lagged, self._old, self.memory):
             pairs.count = wp.zeros(batch, dtype=wp.int32, device=device)
+        self.lagged.fresh, self._old.fresh = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
         self._index = friction.Index()
         vert_face = np.zeros(verts, np.int32)
         vert_face[layout.faces[::-1]] = np.arange(len(layout.faces))[::-1, None]
@@ -140,16 +141,15 @@ class Collision:
         self._ordered = {n: wp.zeros((self.batch, n), dtype=wp.vec3i, device=self.device) for n in (pt, ee) if self._sort}
 
     def _size_contacts(self, pairs: int, rows: int) -> None:
-        place = {"verts": wp.vec4i, "coef": wp.vec4d, "normal": wp.vec3d}
-        limits = place | {"limit": wp.float64}
-        kept = {"verts": wp.vec4i, "pair": wp.int32, "slip": wp.vec3d}
-        self._resize(self.contacts, place | {"force": wp.float64, "gap": wp.float64, "pair": wp.int32}, pairs)
+        place = {"verts": wp.vec4i, "coef": wp.vec4d, "normal": wp.vec3d, "pair": wp.int32}
+        self._resize(self.contacts, place | {"force": wp.float64, "gap": wp.float64}, pairs)
         self._resize(self.contacts, {"row_verts": wp.vec4i, "row": contacts.mat34d}, rows)
         room = pairs if self.friction else 1
-        self._resize(self._old, limits, room)
-        self._resize(self.lagged, limits | kept | {"turn": wp.mat33d}, room)
-        self._resize(self.memory, kept, room)
-        self._resize(self._index, {"first": wp.int32, "next": wp.int32}, room)
+        for lagged in (self.lagged, self._old):  # contacts, and as many that have gone
+            fields = place | {"limit": wp.float64, "slip": wp.vec3d, "turn": wp.mat33d, "swing": wp.vec3d}
+            self._resize(lagged, fields, 2 * room)
+        self._resize(self.memory, {"verts": wp.vec4i, "pair": wp.int32, "slip": wp.vec3d}, room)
+        self._resize(self._index, {"first": wp.int32, "next": wp.int32}, 2 * room)
 
     def _resize(self, struct: Any, fields: dict[str, Any], room: int) -> None:
         """Give arrays of a struct another second dimension; what they hold is kept."""
@@ -323,6 +323,12 @@ class Collision:
         self._launch(friction.size_of_change, vertices, [self._change, active], [self._change_size])
         self._reduce(self._change_size, active, SUM, changed)
         self._launch(friction.share_of_change, self.batch, [self._force, active], [changed])
+
+    def average(self, share: wp.array, active: wp.array) -> None:
+        """Let only a ``share`` (B,) of the limits be those of the last ``lag``, and the rest those before it."""
+        self._launch(friction.weigh_fresh, self.lagged.limit.shape, [share, active], [self.lagged])
+        self._fill_index(self.lagged, active)
+        self._each(friction.add_old, [self._old, share, self._index, active], [self.lagged])
 
     def remember(self, x: wp.array, R: wp.array, friction_slip: float, active: wp.array) -> None:
         """Elastic slips of the contacts at the end of a step, for the next one; arguments as for ``lag``."""

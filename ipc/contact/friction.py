@@ -20,8 +20,7 @@ slides or rolls on to other primitives, what is lost is at most a slip of ε. Pa
 of it collide, the lowest index wins, so nothing depends on scheduling.
 
 *Frames.* z turns with the triangle that the pair's second side belongs to (or with the plane), so that bodies which turn together keep
-their stress. The same turn moves the closest points apart by (Q − 1) Σ c_i x_i^start without any slip, since they are a gap from each
-other, and is taken off.
+their stress. The same turn Q moves the closest points, a gap d apart, by d (n − Qᵀ n) without any slip, which is taken off.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -39,9 +38,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Lagged:
-    """The pairs whose normal force is held fixed.
+    """The pairs whose normal force is held fixed: ``fresh`` ones, from the contacts, and such as an average with older ones kept.
 
-    ``limit`` is μ λ [N], ``slip`` the part of w that the step does not change [m], and ``turn`` Q, from the start of the step to the lag.
+    ``limit`` is μ λ [N], ``slip`` the part of w that the step does not change [m], ``turn`` Q from the start of the step to the lag, and
+    ``swing`` what the gap turned by it [m].
     """
 
     verts: wp.array2d(dtype=wp.vec4i)
@@ -51,7 +51,9 @@ class Lagged:
     pair: IntArray2d
     slip: VecArray2d
     turn: MatArray2d
+    swing: VecArray2d
     count: IntArray
+    fresh: IntArray
 
 
 @wp.struct
@@ -142,16 +144,6 @@ def turn_of(turning: Turning, x: VecArray2d, R: MatArray2d, env: wp.int32, verts
 
 
 @wp.func
-def apart(x: VecArray2d, env: wp.int32, verts: wp.vec4i, c: wp.vec4d) -> wp.vec3d:
-    """Σ c_i x_i [m] of a pair of primitives, which a turn changes; zero of a point and a plane."""
-    t = wp.vec3d()
-    if verts[1] >= 0:
-        for i in range(1, 4):
-            t += c[i] * (x[env, verts[i]] - x[env, verts[0]])
-    return t
-
-
-@wp.func
 def in_tangent_plane(z: wp.vec3d, n: wp.vec3d) -> wp.vec3d:
     """z turned into the plane across n; its length is kept."""
     flat = z - wp.dot(z, n) * n
@@ -201,19 +193,58 @@ def fill_index(verts: wp.array2d(dtype=wp.vec4i), count: IntArray, active: IntAr
         index.next[env, i] = wp.atomic_exch(index.first, env, slot_of(verts[env, i], index.first.shape[1]), i)
 
 
+@wp.func
+def copy_pair(pairs: Lagged, env: wp.int32, i: wp.int32, out: Lagged, k: wp.int32):
+    """Entry k of ``out`` becomes entry i of ``pairs``."""
+    out.verts[env, k] = pairs.verts[env, i]
+    out.coef[env, k] = pairs.coef[env, i]
+    out.normal[env, k] = pairs.normal[env, i]
+    out.limit[env, k] = pairs.limit[env, i]
+    out.pair[env, k] = pairs.pair[env, i]
+    out.slip[env, k] = pairs.slip[env, i]
+    out.turn[env, k] = pairs.turn[env, i]
+    out.swing[env, k] = pairs.swing[env, i]
+
+
 @wp.kernel
 def keep_lagged(lagged: Lagged, active: IntArray, out: Lagged):
-    """Copies the limits of the active environments and where they act."""
+    """Copies the lagged pairs of the active environments."""
     env, i = wp.tid()
     if active[env] == 0:
         return
     if i == 0:
         out.count[env] = lagged.count[env]
+        out.fresh[env] = lagged.fresh[env]
     if i < lagged.count[env]:
-        out.verts[env, i] = lagged.verts[env, i]
-        out.coef[env, i] = lagged.coef[env, i]
-        out.normal[env, i] = lagged.normal[env, i]
-        out.limit[env, i] = lagged.limit[env, i]
+        copy_pair(lagged, env, i, out, i)
+
+
+@wp.kernel
+def weigh_fresh(share: FloatArray, active: IntArray, out: Lagged):
+    """Multiplies the limits of the fresh pairs by their share."""
+    env, i = wp.tid()
+    if active[env] != 0 and i < out.fresh[env]:
+        out.limit[env, i] = share[env] * out.limit[env, i]
+
+
+@wp.kernel
+def add_old(old: Lagged, share: FloatArray, index: Index, active: IntArray, lanes: wp.int32, out: Lagged):
+    """Adds what the average has of the last lag's fresh pairs: to the same pair, or as one of its own where that has gone.
+
+    So no pair is kept beyond two lags, and there are never more than twice as many as contacts.
+    """
+    env, lane = wp.tid()
+    if active[env] == 0:
+        return
+    for i in range(lane, old.fresh[env], lanes):
+        limit = (wp.float64(1.0) - share[env]) * old.limit[env, i]
+        entry = find_pair(index, out.verts, out.pair, env, old.verts[env, i], old.pair[env, i])
+        if entry >= 0:
+            out.limit[env, entry] = out.limit[env, entry] + limit
+        elif limit > wp.float64(0.0):
+            entry = wp.atomic_add(out.count, env, 1)
+            copy_pair(old, env, i, out, entry)
+            out.limit[env, entry] = limit
 
 
 @wp.kernel
@@ -235,12 +266,12 @@ def lag_contacts(
         return
     if i == 0:
         out.count[env] = wp.min(contacts.count[env], contacts.force.shape[1])
-    if i < contacts.count[env]:
+        out.fresh[env] = out.count[env]
+    if i < wp.min(contacts.count[env], contacts.force.shape[1]):
         verts, coef, n, pair = contacts.verts[env, i], contacts.coef[env, i], contacts.normal[env, i], contacts.pair[env, i]
         turn = turn_of(turning, x, R, env, verts, pair)
-        arm = apart(turning.x, env, verts, coef)
-        moved = turn * arm - arm
-        slip = wp.dot(moved, n) * n - moved
+        swing = contacts.gap[env, i] * (n - wp.transpose(turn) * n)
+        slip = wp.dot(swing, n) * n - swing
         entry = find_pair(index, memory.verts, memory.pair, env, verts, pair)
         if entry >= 0:
             slip += in_tangent_plane(turn * memory.slip[env, entry], n)
@@ -251,6 +282,7 @@ def lag_contacts(
         out.pair[env, i] = pair
         out.slip[env, i] = slip
         out.turn[env, i] = turn
+        out.swing[env, i] = swing
 
 
 @wp.kernel
@@ -272,19 +304,18 @@ def remember(
         return
     if i == 0:
         memory.count[env] = wp.min(contacts.count[env], contacts.force.shape[1])
-    if i < contacts.count[env]:
+    if i < wp.min(contacts.count[env], contacts.force.shape[1]):
         verts, pair = contacts.verts[env, i], contacts.pair[env, i]
         entry, z = find_pair(index, lagged.verts, lagged.pair, env, verts, pair), wp.vec3d()
         if entry >= 0:
             c, n = lagged.coef[env, entry], lagged.normal[env, entry]
-            turn = turn_of(turning, x, R, env, verts, pair)
-            arm = apart(turning.x, env, verts, c)
-            moved = turn * arm - lagged.turn[env, entry] * arm
-            w = lagged.slip[env, entry] + sliding(x, turning.x, env, verts, c, n) - (moved - wp.dot(moved, n) * n)
+            turn, now = turn_of(turning, x, R, env, verts, pair), contacts.normal[env, i]
+            swing = contacts.gap[env, i] * (now - wp.transpose(turn) * now) - lagged.swing[env, entry]
+            w = lagged.slip[env, entry] + sliding(x, turning.x, env, verts, c, n) - (swing - wp.dot(swing, n) * n)
             y = wp.length(w)
             if y > eps:
                 w = (eps / y) * w
-            z = in_tangent_plane(turn * (wp.transpose(lagged.turn[env, entry]) * w), contacts.normal[env, i])
+            z = in_tangent_plane(turn * (wp.transpose(lagged.turn[env, entry]) * w), now)
         memory.verts[env, i] = verts
         memory.pair[env, i] = pair
         memory.slip[env, i] = z

@@ -183,7 +183,8 @@ class Newton:
             pot.touch(state.decisions.pending)
             state.launch(decisions.choose_lagging)
             pot.collision.lag(pot.x, pot.R, state.decisions.lagging, state.decisions.changed)
-            state.launch(decisions.after_lag, self.settings.friction_tolerance)
+            state.launch(decisions.after_lag, self.settings.friction_tolerance, self.settings.friction_relags)
+            wp.capture_if(state.flags.average, pot.collision.average, share=state.decisions.share, active=state.decisions.averaging)
 
     def _solve(self) -> None:
         """p for the active environments; with a definite matrix where negative curvature was met."""
