@@ -119,11 +119,14 @@ class Collision:
             pairs.count = wp.zeros(batch, dtype=wp.int32, device=device)
         self.lagged.fresh, self._old.fresh = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
         self._index = friction.Index()
-        vert_face = np.zeros(verts, np.int32)
-        vert_face[layout.faces[::-1]] = np.arange(len(layout.faces))[::-1, None]
-        self._turning = filled(
-            friction.Turning, device, {"faces": layout.faces, "vert_face": vert_face, "plane": layout.pairs[:, 1]}
-        )
+        framed = layout.frame_moves[:bodies] == 1
+        soft = np.diff(layout.node_start) > 0
+        # Slips turn with the second body of a pair, but rather with a rigid one, or else with one that has a frame.
+        rank = 2 * (framed & ~soft) + (framed & soft)
+        first, second = layout.pairs.T
+        values = {"framed": framed, "node_start": layout.node_start, "body": np.where(rank[first] > rank[second], first, second)}
+        self._turning = filled(friction.Turning, device, values)
+        self._turning.turn = wp.zeros((batch, bodies), dtype=wp.mat33d, device=device)
         self._size_contacts(256, 768)
         self.overflow = wp.zeros(1, dtype=wp.int32, device=device)
         self._any_stale = wp.zeros(1, dtype=wp.int32, device=device)
@@ -302,20 +305,21 @@ class Collision:
 
     # --- friction --------------------------------------------------------------------------------------------------------------
 
-    def begin_step(self, x_start: wp.array, frame_q: wp.array) -> None:
-        """Say where vertices (B, V) and frames (B, frames) are kept as they were at the start of a step."""
-        self._turning.x, self._turning.frame_q = x_start, frame_q
+    def measure_from(self, x: wp.array, y: wp.array, frame_q: wp.array) -> None:
+        """Say where vertices (B, V), nodes (B, N) and frames (B, frames) are kept as they were at the start of a step."""
+        self._turning.x, self._turning.y, self._turning.frame_q = x, y, frame_q
 
-    def lag(self, x: wp.array, R: wp.array, active: wp.array, changed: wp.array) -> None:
+    def lag(self, y: wp.array, R: wp.array, active: wp.array, changed: wp.array) -> None:
         """Freeze active contacts for friction; ``changed`` (B,): relative change of limits μ λ n.
 
         Args:
-            x, R: vertices (B, V) [m] and frames (B, frames) that the contacts belong to.
+            y, R: nodes (B, N) and frames (B, frames) that the contacts belong to.
         """
+        self._measure_turns(y, R, active)
         limits, vertices = self.lagged.limit.shape, self._change.shape
         self._launch(friction.keep_lagged, limits, [self.lagged, active], [self._old])
         self._fill_index(self.memory, active)
-        inputs = [x, R, self._turning, self.contacts, self.memory, self._index, self.pair_mu, active]
+        inputs = [self._turning, self.contacts, self.memory, self._index, self.pair_mu, active]
         self._launch(friction.lag_contacts, limits, inputs, [self.lagged])
         self._launch(friction.clear_change, vertices, [active], [self._change, self._force, changed])
         for lagged, sign in ((self.lagged, 1.0), (self._old, -1.0)):
@@ -330,11 +334,15 @@ class Collision:
         self._fill_index(self.lagged, active)
         self._each(friction.add_old, [self._old, share, self._index, active], [self.lagged])
 
-    def remember(self, x: wp.array, R: wp.array, friction_slip: float, active: wp.array) -> None:
-        """Elastic slips of the contacts at the end of a step, for the next one; arguments as for ``lag``."""
+    def remember(self, x: wp.array, y: wp.array, R: wp.array, friction_slip: float, active: wp.array) -> None:
+        """Elastic slips of the contacts at the end of a step, for the next one; x (B, V) and arguments as for ``lag``."""
+        self._measure_turns(y, R, active)
         self._fill_index(self.lagged, active)
-        inputs = [x, R, self._turning, self.contacts, self.lagged, self._index, friction_slip, active]
+        inputs = [x, self._turning, self.contacts, self.lagged, self._index, friction_slip, active]
         self._launch(friction.remember, self.memory.slip.shape, inputs, [self.memory])
+
+    def _measure_turns(self, y: wp.array, R: wp.array, active: wp.array) -> None:
+        self._launch(friction.turns, self._turning.turn.shape, [self._turning, y, R, active], [self._turning.turn])
 
     def _fill_index(self, pairs: Any, active: wp.array) -> None:
         self._launch(friction.clear_index, self._index.first.shape, [active], [self._index])

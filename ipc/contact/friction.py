@@ -19,8 +19,8 @@ to be averaged from the pairs and back in each step, which smooths the tractions
 slides or rolls on to other primitives, what is lost is at most a slip of ε. Pairs are found by a hash of their vertices. Where two slots
 of it collide, the lowest index wins, so nothing depends on scheduling.
 
-*Frames.* z turns with the triangle that the pair's second side belongs to (or with the plane), so that bodies which turn together keep
-their stress. The same turn Q moves the closest points, a gap d apart, by d (n − Qᵀ n) without any slip, which is taken off.
+*Frames.* z turns with one of the two bodies, the one that a frame carries if there is one, so that bodies which turn together keep their
+stress. The same turn Q moves the closest points, a gap d apart, by d (n − Qᵀ n) without any slip, which is taken off.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -76,18 +76,21 @@ class Index:
 
 @wp.struct
 class Turning:
-    """Where the material of the pairs' second sides was at the start of the step, to tell how far it turned.
+    """How far bodies have turned since the start of the step.
 
     Attributes:
-        x: vertices at the start [m] (B, V).    frame_q: frames at the start (B, frames).
-        faces: (F, 3).    vert_face: a face of each vertex (V,).    plane: second body of each body pair (P,).
+        x, y: vertices (B, V) and nodes (B, N) at the start [m].    frame_q: frames at the start (B, frames).
+        framed: 1 where a body's frame carries it (bodies,).    node_start: first node of each body and the total.
+        body: the body that each body pair's slips turn with (P,).    turn: Q of each body (B, bodies).
     """
 
     x: VecArray2d
+    y: VecArray2d
     frame_q: QuatArray2d
-    faces: IntArray2d
-    vert_face: IntArray
-    plane: IntArray
+    framed: IntArray
+    node_start: IntArray
+    body: IntArray
+    turn: MatArray2d
 
 
 @wp.func
@@ -125,22 +128,42 @@ def sliding(x: VecArray2d, start: VecArray2d, env: wp.int32, verts: wp.vec4i, c:
 
 
 @wp.func
-def face_frame(x: VecArray2d, faces: IntArray2d, env: wp.int32, face: wp.int32) -> wp.mat33d:
-    """Orthonormal axes of a triangle, as columns."""
-    a = x[env, faces[face, 0]]
-    along, side = wp.normalize(x[env, faces[face, 1]] - a), x[env, faces[face, 2]] - a
-    n = wp.normalize(wp.cross(along, side))
-    return wp.matrix_from_cols(along, wp.cross(n, along), n)
+def rotation_in(A: wp.mat33d) -> wp.mat33d:
+    """The rotation nearest to A, from the identity on (Müller et al. 2016, "A Robust Method to Extract the Rotational Part")."""
+    R = wp.identity(n=3, dtype=wp.float64)
+    for _ in range(30):
+        turn, size = wp.vec3d(), wp.float64(0.0)
+        for k in range(3):
+            r, a = wp.vec3d(R[0, k], R[1, k], R[2, k]), wp.vec3d(A[0, k], A[1, k], A[2, k])
+            turn += wp.cross(r, a)
+            size += wp.dot(r, a)
+        angle = wp.length(turn)
+        if angle <= wp.float64(1.0e-15) * wp.abs(size) or size == wp.float64(0.0):
+            break
+        R = wp.quat_to_matrix(wp.quat_from_axis_angle(turn / angle, angle / wp.abs(size))) * R
+    return R
 
 
-@wp.func
-def turn_of(turning: Turning, x: VecArray2d, R: MatArray2d, env: wp.int32, verts: wp.vec4i, pair: wp.int32) -> wp.mat33d:
-    """Q, the rotation of the pair's second side from the start of the step to x and R."""
-    if verts[1] < 0:
-        body = turning.plane[pair]
-        return R[env, body] * wp.transpose(wp.quat_to_matrix(turning.frame_q[env, body]))
-    face = turning.vert_face[verts[3]]
-    return face_frame(x, turning.faces, env, face) * wp.transpose(face_frame(turning.x, turning.faces, env, face))
+@wp.kernel
+def turns(turning: Turning, y: VecArray2d, R: MatArray2d, active: IntArray, turn: MatArray2d):
+    """Q of every body from the start of the step to y and R; of up to 256 nodes where no frame carries it."""
+    env, body = wp.tid()
+    if active[env] == 0:
+        return
+    if turning.framed[body] != 0:
+        turn[env, body] = R[env, body] * wp.transpose(wp.quat_to_matrix(turning.frame_q[env, body]))
+        return
+    first, last = turning.node_start[body], turning.node_start[body + 1]
+    step = wp.max((last - first) / 256, 1)
+    centre, before, count = wp.vec3d(), wp.vec3d(), wp.float64(0.0)
+    for i in range(first, last, step):
+        centre += y[env, i]
+        before += turning.y[env, i]
+        count += wp.float64(1.0)
+    A = wp.mat33d()
+    for i in range(first, last, step):
+        A += wp.outer(y[env, i] - centre / count, turning.y[env, i] - before / count)
+    turn[env, body] = rotation_in(A)
 
 
 @wp.func
@@ -249,8 +272,6 @@ def add_old(old: Lagged, share: FloatArray, index: Index, active: IntArray, lane
 
 @wp.kernel
 def lag_contacts(
-    x: VecArray2d,
-    R: MatArray2d,
     turning: Turning,
     contacts: Contacts,
     memory: Memory,
@@ -269,7 +290,7 @@ def lag_contacts(
         out.fresh[env] = out.count[env]
     if i < wp.min(contacts.count[env], contacts.force.shape[1]):
         verts, coef, n, pair = contacts.verts[env, i], contacts.coef[env, i], contacts.normal[env, i], contacts.pair[env, i]
-        turn = turn_of(turning, x, R, env, verts, pair)
+        turn = turning.turn[env, turning.body[pair]]
         swing = contacts.gap[env, i] * (n - wp.transpose(turn) * n)
         slip = wp.dot(swing, n) * n - swing
         entry = find_pair(index, memory.verts, memory.pair, env, verts, pair)
@@ -288,7 +309,6 @@ def lag_contacts(
 @wp.kernel
 def remember(
     x: VecArray2d,
-    R: MatArray2d,
     turning: Turning,
     contacts: Contacts,
     lagged: Lagged,
@@ -309,7 +329,7 @@ def remember(
         entry, z = find_pair(index, lagged.verts, lagged.pair, env, verts, pair), wp.vec3d()
         if entry >= 0:
             c, n = lagged.coef[env, entry], lagged.normal[env, entry]
-            turn, now = turn_of(turning, x, R, env, verts, pair), contacts.normal[env, i]
+            turn, now = turning.turn[env, turning.body[pair]], contacts.normal[env, i]
             swing = contacts.gap[env, i] * (now - wp.transpose(turn) * now) - lagged.swing[env, entry]
             w = lagged.slip[env, entry] + sliding(x, turning.x, env, verts, c, n) - (swing - wp.dot(swing, n) * n)
             y = wp.length(w)

@@ -182,7 +182,7 @@ class Newton:
         with self._stage("lag"):
             pot.touch(state.decisions.pending)
             state.launch(decisions.choose_lagging)
-            pot.collision.lag(pot.x, pot.R, state.decisions.lagging, state.decisions.changed)
+            pot.collision.lag(pot.y, pot.R, state.decisions.lagging, state.decisions.changed)
             state.launch(decisions.after_lag, self.settings.friction_tolerance, self.settings.friction_relags)
             wp.capture_if(state.flags.average, pot.collision.average, share=state.decisions.share, active=state.decisions.averaging)
 
@@ -288,7 +288,7 @@ class Newton:
             pot.set_frames(d.progress, pot.R, pot.t)
             pot.place_vertices(pot.y, pot.R, pot.t, pot.x)
             if self._friction:
-                pot.collision.remember(pot.x, pot.R, self.settings.friction_slip, d.good)
+                pot.collision.remember(pot.x, pot.y, pot.R, self.settings.friction_slip, d.good)
             wp.copy(pot.frame_q, pot.now_q)
             wp.copy(pot.frame_p, pot.t)
             pot.energies()

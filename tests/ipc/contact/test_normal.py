@@ -181,7 +181,7 @@ def test_gradient_matches_finite_differences_near_parallel_edges(rng: np.random.
 def test_friction_matches_ipctk(slide: float, rng: np.random.Generator) -> None:
     scene = Scene(0.02, TILTS["corner"], friction=MU)
     scene.evaluate(scene.x)
-    scene.solver.collision.lag(scene.solver.x, scene.solver.R, scene.solver.everyone, scene.solver.reach)
+    scene.solver.collision.lag(scene.solver.y, scene.solver.R, scene.solver.everyone, scene.solver.reach)
     _, normal = scene.evaluate(scene.x)
     moved = scene.x.copy()
     moved[scene.x[:, 2] > 1.001] += slide * np.array([0.6, 0.8, 0.1])
@@ -207,7 +207,7 @@ def barrier_gradient(x: np.ndarray) -> np.ndarray:
 def test_friction_hessian_matches_finite_differences(rng: np.random.Generator) -> None:
     scene = Scene(0.02, TILTS["corner"], friction=MU)
     scene.evaluate(scene.x)
-    scene.solver.collision.lag(scene.solver.x, scene.solver.R, scene.solver.everyone, scene.solver.reach)
+    scene.solver.collision.lag(scene.solver.y, scene.solver.R, scene.solver.everyone, scene.solver.reach)
     far = scene.x.copy()
     far[scene.x[:, 2] > 1.001] += [0.4 * EPS, 0.1 * EPS, 0.0]
     bare = Scene(0.02, TILTS["corner"])
