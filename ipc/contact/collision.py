@@ -132,7 +132,7 @@ class Collision:
         self._any_stale = wp.zeros(1, dtype=wp.int32, device=device)
         self._change = wp.zeros((batch, verts), dtype=wp.vec3d, device=device)
         self._change_size = wp.zeros((batch, verts), dtype=wp.float64, device=device)
-        self._force = wp.zeros(batch, dtype=wp.float64, device=device)
+        self._force = wp.zeros((batch, 2), dtype=wp.float64, device=device)
         self._reduce = Reducer(batch, max(1, verts), device)
         self._reduce.prepare(verts)
         self._boxes.low.fill_(wp.vec3d(1.0, 1.0, 1.0))  # an empty box (low above high): the first check builds a list
@@ -309,11 +309,13 @@ class Collision:
         """Say where vertices (B, V), nodes (B, N) and frames (B, frames) are kept as they were at the start of a step."""
         self._turning.x, self._turning.y, self._turning.frame_q = x, y, frame_q
 
-    def lag(self, y: wp.array, R: wp.array, active: wp.array, changed: wp.array) -> None:
-        """Freeze active contacts for friction; ``changed`` (B,): relative change of limits μ λ n.
+    def lag(self, y: wp.array, R: wp.array, active: wp.array, changed: wp.array, sum_changed: wp.array) -> None:
+        """Freeze active contacts for friction.
 
         Args:
             y, R: nodes (B, N) and frames (B, frames) that the contacts belong to.
+            active: mask (B,).
+            changed, sum_changed: become the relative change of the limits μ λ n at the vertices, and of their sum (B,).
         """
         self._measure_turns(y, R, active)
         limits, vertices = self.lagged.limit.shape, self._change.shape
@@ -326,7 +328,7 @@ class Collision:
             self._each(friction.lag_difference, [lagged, sign, active], [self._change, self._force])
         self._launch(friction.size_of_change, vertices, [self._change, active], [self._change_size])
         self._reduce(self._change_size, active, SUM, changed)
-        self._launch(friction.share_of_change, self.batch, [self._force, active], [changed])
+        self._launch(friction.share_of_change, self.batch, [self._force, active], [changed, sum_changed])
 
     def average(self, share: wp.array, active: wp.array) -> None:
         """Let only a ``share`` (B,) of the limits be those of the last ``lag``, and the rest those before it."""

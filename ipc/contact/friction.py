@@ -407,8 +407,8 @@ def friction_change(
 
 
 @wp.kernel
-def lag_difference(lagged: Lagged, sign: wp.float64, active: IntArray, lanes: wp.int32, force: VecArray2d, size: FloatArray):
-    """Adds sign · μ λ c_i n of every lagged pair to its vertices [N], and μ λ to ``size`` [N].
+def lag_difference(lagged: Lagged, sign: wp.float64, active: IntArray, lanes: wp.int32, force: VecArray2d, size: FloatArray2d):
+    """Adds sign · μ λ c_i n of every lagged pair to its vertices [N], and μ λ to ``size`` [N] of its sign.
 
     Called with + for the new and − for the old pairs, it leaves what changed of the normal forces *and* of where they act.
     """
@@ -420,18 +420,18 @@ def lag_difference(lagged: Lagged, sign: wp.float64, active: IntArray, lanes: wp
         for k in range(4):
             if verts[k] >= 0:
                 wp.atomic_add(force, env, verts[k], (sign * lagged.limit[env, i] * c[k]) * n)
-        if sign > wp.float64(0.0):
-            wp.atomic_add(size, env, lagged.limit[env, i])
+        wp.atomic_add(size, env, wp.int32(sign > wp.float64(0.0)), lagged.limit[env, i])
 
 
 @wp.kernel
-def clear_change(active: IntArray, change: VecArray2d, force: FloatArray, changed: FloatArray):
+def clear_change(active: IntArray, change: VecArray2d, force: FloatArray2d, changed: FloatArray):
     env, v = wp.tid()
     if active[env] == 0:
         return
     change[env, v] = wp.vec3d()
     if v == 0:
-        force[env] = wp.float64(0.0)
+        force[env, 0] = wp.float64(0.0)
+        force[env, 1] = wp.float64(0.0)
         changed[env] = wp.float64(0.0)
 
 
@@ -443,8 +443,10 @@ def size_of_change(change: VecArray2d, active: IntArray, size: FloatArray2d):
 
 
 @wp.kernel
-def share_of_change(force: FloatArray, active: IntArray, changed: FloatArray):
-    """changed ← changed / Σ μ λ."""
+def share_of_change(force: FloatArray2d, active: IntArray, changed: FloatArray, sum_changed: FloatArray):
+    """changed ← changed / Σ μ λ, and sum_changed ← the relative change of Σ μ λ."""
     env = wp.tid()
     if active[env] != 0:
-        changed[env] = changed[env] / wp.max(force[env], wp.float64(1.0e-300))
+        total = wp.max(force[env, 1], wp.float64(1.0e-300))
+        changed[env] = changed[env] / total
+        sum_changed[env] = wp.abs(force[env, 1] - force[env, 0]) / total

@@ -75,6 +75,9 @@ def choose_lagging(d: Decisions, f: Flags):
 def after_lag(tolerance: wp.float64, max_relags: wp.int32, d: Decisions, f: Flags):
     """Minimises (again) where friction is new or changed by more than the tolerance.
 
+    From half of all renewals on only the sum of the limits has to settle: how a light contact divides it among vertices may lie within
+    what Newton's tolerance leaves open.
+
     Where the change is not half the one before, the next forces are the mean of the new and the last: normal forces that friction has
     changed, and friction that they bound, would else chase each other.
     """
@@ -83,8 +86,9 @@ def after_lag(tolerance: wp.float64, max_relags: wp.int32, d: Decisions, f: Flag
     if d.lagging[env] == 0:
         return
     d.pending[env] = 0
-    if d.relags[env] >= 0 and d.changed[env] <= tolerance:
-        return
+    if d.relags[env] >= 0:
+        if d.changed[env] <= tolerance or (2 * d.relags[env] >= max_relags and d.sum_changed[env] <= tolerance):
+            return
     if d.relags[env] >= max_relags:
         d.converged[env] = 0
         return

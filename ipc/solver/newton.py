@@ -182,9 +182,10 @@ class Newton:
         with self._stage("lag"):
             pot.touch(state.decisions.pending)
             state.launch(decisions.choose_lagging)
-            pot.collision.lag(pot.y, pot.R, state.decisions.lagging, state.decisions.changed)
+            d = state.decisions
+            pot.collision.lag(pot.y, pot.R, d.lagging, d.changed, d.sum_changed)
             state.launch(decisions.after_lag, self.settings.friction_tolerance, self.settings.friction_relags)
-            wp.capture_if(state.flags.average, pot.collision.average, share=state.decisions.share, active=state.decisions.averaging)
+            wp.capture_if(state.flags.average, pot.collision.average, share=d.share, active=d.averaging)
 
     def _solve(self) -> None:
         """p for the active environments; with a definite matrix where negative curvature was met."""

@@ -59,6 +59,7 @@ class Decisions:
     floor: FloatArray  # gap that has to stay
     changed: FloatArray  # share of the friction forces that the last lag changed
     last_changed: FloatArray  # and the one before
+    sum_changed: FloatArray  # by how much the last lag changed the sum of the limits, as a share of it
     share: FloatArray  # of the last lag in the friction forces, the rest being those before it
     averaging: IntArray  # that share is not 1
     speed: FloatArray
