@@ -305,23 +305,23 @@ class Collision:
 
     # --- friction --------------------------------------------------------------------------------------------------------------
 
-    def measure_from(self, x: wp.array, y: wp.array, frame_q: wp.array) -> None:
-        """Say where vertices (B, V), nodes (B, N) and frames (B, frames) are kept as they were at the start of a step."""
-        self._turning.x, self._turning.y, self._turning.frame_q = x, y, frame_q
+    def measure_from(self, x: wp.array, y: wp.array, frame_q: wp.array, goal_q: wp.array) -> None:
+        """Say where vertices (B, V), nodes (B, N), frames (B, frames) of the start of a step are kept, and the frames' goals."""
+        self._turning.x, self._turning.y, self._turning.frame_q, self._turning.goal_q = x, y, frame_q, goal_q
 
-    def lag(self, y: wp.array, R: wp.array, active: wp.array, changed: wp.array, sum_changed: wp.array) -> None:
+    def lag(self, relags: wp.array, active: wp.array, changed: wp.array, sum_changed: wp.array) -> None:
         """Freeze active contacts for friction.
 
         Args:
-            y, R: nodes (B, N) and frames (B, frames) that the contacts belong to.
+            relags: −1 at the start of a step (B,).
             active: mask (B,).
             changed, sum_changed: become the relative change of the limits μ λ n at the vertices, and of their sum (B,).
         """
-        self._measure_turns(y, R, active)
+        self._launch(friction.turns_ahead, self._turning.turn.shape, [self._turning, active], [self._turning.turn])
         limits, vertices = self.lagged.limit.shape, self._change.shape
         self._launch(friction.keep_lagged, limits, [self.lagged, active], [self._old])
         self._fill_index(self.memory, active)
-        inputs = [self._turning, self.contacts, self.memory, self._index, self.pair_mu, active]
+        inputs = [self._turning, self.contacts, self.memory, self._index, self.pair_mu, relags, active]
         self._launch(friction.lag_contacts, limits, inputs, [self.lagged])
         self._launch(friction.clear_change, vertices, [active], [self._change, self._force, changed])
         for lagged, sign in ((self.lagged, 1.0), (self._old, -1.0)):
@@ -337,14 +337,17 @@ class Collision:
         self._each(friction.add_old, [self._old, share, self._index, active], [self.lagged])
 
     def remember(self, x: wp.array, y: wp.array, R: wp.array, friction_slip: float, active: wp.array) -> None:
-        """Elastic slips of the contacts at the end of a step, for the next one; x (B, V) and arguments as for ``lag``."""
-        self._measure_turns(y, R, active)
+        """Elastic slips of the contacts at the end of a step, for the next one.
+
+        Args:
+            x, y, R: vertices (B, V), nodes (B, N) and frames (B, frames) that the contacts belong to.
+            friction_slip: ε [m].
+            active: mask (B,).
+        """
+        self._launch(friction.turns, self._turning.turn.shape, [self._turning, y, R, active], [self._turning.turn])
         self._fill_index(self.lagged, active)
         inputs = [x, self._turning, self.contacts, self.lagged, self._index, friction_slip, active]
         self._launch(friction.remember, self.memory.slip.shape, inputs, [self.memory])
-
-    def _measure_turns(self, y: wp.array, R: wp.array, active: wp.array) -> None:
-        self._launch(friction.turns, self._turning.turn.shape, [self._turning, y, R, active], [self._turning.turn])
 
     def _fill_index(self, pairs: Any, active: wp.array) -> None:
         self._launch(friction.clear_index, self._index.first.shape, [active], [self._index])

@@ -20,7 +20,8 @@ slides or rolls on to other primitives, what is lost is at most a slip of ε. Pa
 of it collide, the lowest index wins, so nothing depends on scheduling.
 
 *Frames.* z turns with one of the two bodies, the one that a frame carries if there is one, so that bodies which turn together keep their
-stress. The same turn Q moves the closest points, a gap d apart, by d (n − Qᵀ n) without any slip, which is taken off.
+stress. The same turn Q moves the closest points, a gap d apart, by d (n − Qᵀ n) without any slip, which is taken off. In the step it is the
+turn that the frame is ordered to make, so that all its lags agree; what bodies without a frame turn counts at its end.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -40,8 +41,8 @@ wp.set_module_options({"enable_backward": False})
 class Lagged:
     """The pairs whose normal force is held fixed: ``fresh`` ones, from the contacts, and such as an average with older ones kept.
 
-    ``limit`` is μ λ [N], ``slip`` the part of w that the step does not change [m], ``turn`` Q from the start of the step to the lag, and
-    ``swing`` what the gap turned by it [m].
+    ``limit`` is μ λ [N], ``slip`` the part of w that the step does not change [m], ``turn`` Q over the step as it was known at the lag,
+    and ``swing`` what the gap turned by it [m].
     """
 
     verts: wp.array2d(dtype=wp.vec4i)
@@ -79,7 +80,7 @@ class Turning:
     """How far bodies have turned since the start of the step.
 
     Attributes:
-        x, y: vertices (B, V) and nodes (B, N) at the start [m].    frame_q: frames at the start (B, frames).
+        x, y: vertices (B, V) and nodes (B, N) at the start [m].    frame_q, goal_q: frames at the start and at the end (B, frames).
         framed: 1 where a body's frame carries it (bodies,).    node_start: first node of each body and the total.
         body: the body that each body pair's slips turn with (P,).    turn: Q of each body (B, bodies).
     """
@@ -87,6 +88,7 @@ class Turning:
     x: VecArray2d
     y: VecArray2d
     frame_q: QuatArray2d
+    goal_q: QuatArray2d
     framed: IntArray
     node_start: IntArray
     body: IntArray
@@ -142,6 +144,18 @@ def rotation_in(A: wp.mat33d) -> wp.mat33d:
             break
         R = wp.quat_to_matrix(wp.quat_from_axis_angle(turn / angle, angle / wp.abs(size))) * R
     return R
+
+
+@wp.kernel
+def turns_ahead(turning: Turning, active: IntArray, turn: MatArray2d):
+    """Q of every body over the whole step as its frame is to move; 1 where no frame carries it."""
+    env, body = wp.tid()
+    if active[env] == 0:
+        return
+    turn[env, body] = wp.identity(n=3, dtype=wp.float64)
+    if turning.framed[body] != 0:
+        end, start = turning.goal_q[env, body], turning.frame_q[env, body]
+        turn[env, body] = wp.quat_to_matrix(end) * wp.transpose(wp.quat_to_matrix(start))
 
 
 @wp.kernel
@@ -277,11 +291,12 @@ def lag_contacts(
     memory: Memory,
     index: Index,
     mu: FloatArray,
+    relags: IntArray,
     active: IntArray,
     # outputs
     out: Lagged,
 ):
-    """Freezes the contacts of the active environments, with what they remember."""
+    """Freezes the contacts of the active environments, with what they remember; ``relags`` is −1 at the start of the step."""
     env, i = wp.tid()
     if active[env] == 0:
         return
@@ -292,6 +307,8 @@ def lag_contacts(
         verts, coef, n, pair = contacts.verts[env, i], contacts.coef[env, i], contacts.normal[env, i], contacts.pair[env, i]
         turn = turning.turn[env, turning.body[pair]]
         swing = contacts.gap[env, i] * (n - wp.transpose(turn) * n)
+        if relags[env] < 0:
+            swing = contacts.gap[env, i] * (turn * n - n)
         slip = wp.dot(swing, n) * n - swing
         entry = find_pair(index, memory.verts, memory.pair, env, verts, pair)
         if entry >= 0:

@@ -183,7 +183,7 @@ class Newton:
             pot.touch(state.decisions.pending)
             state.launch(decisions.choose_lagging)
             d = state.decisions
-            pot.collision.lag(pot.y, pot.R, d.lagging, d.changed, d.sum_changed)
+            pot.collision.lag(d.relags, d.lagging, d.changed, d.sum_changed)
             state.launch(decisions.after_lag, self.settings.friction_tolerance, self.settings.friction_relags)
             wp.capture_if(state.flags.average, pot.collision.average, share=d.share, active=d.averaging)
 

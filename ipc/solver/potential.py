@@ -96,7 +96,7 @@ class Potential:
         self.el_J, self.el_energy, self.el_change, self.el_J1 = (numbers(batch, elements) for _ in range(4))
         self.node_change, self.force_size, self.vert_size = numbers(batch, nodes), numbers(batch, nodes), numbers(batch, verts)
         self.reach, self.barrier, self.elastic_energy, self.kinetic = (numbers() for _ in range(4))
-        self.collision.measure_from(self.x_start, self.y_start, self.frame_q)
+        self.collision.measure_from(self.x_start, self.y_start, self.frame_q, self.goal_q)
         self.project = wp.zeros(batch, dtype=wp.int32, device=device)
         self.everyone = wp.full(batch, 1, dtype=wp.int32, device=device)
 
