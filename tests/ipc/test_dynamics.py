@@ -73,7 +73,7 @@ def test_block_slides_with_the_right_acceleration(kind: str) -> None:
     assert wrench[0] == pytest.approx(0.49 * weight, rel=1e-3)
 
 
-def collide(velocity_tolerance: float, linear_tolerance: float) -> tuple[float, float]:
+def collide(velocity_tolerance: float, linear_tolerance: float, relags: int = 30) -> tuple[float, float]:
     """Two soft cubes meet off-centre, with friction, without gravity.
 
     Returns:
@@ -84,9 +84,8 @@ def collide(velocity_tolerance: float, linear_tolerance: float) -> tuple[float, 
         ipc.SoftBody("a", a, ipc.Material(1e5, 0.4)),
         ipc.SoftBody("b", ipc.TetMesh(b.vertices + np.array([0.023, 0.006, 0.004]), b.tets), ipc.Material(2e5, 0.4)),
     ]
-    settings = ipc.Settings(
-        dt=2e-3, d_hat=1e-3, friction=0.3, velocity_tolerance=velocity_tolerance, linear_tolerance=linear_tolerance
-    )
+    tolerances = {"velocity_tolerance": velocity_tolerance, "linear_tolerance": linear_tolerance}
+    settings = ipc.Settings(dt=2e-3, d_hat=1e-3, friction=0.3, friction_relags=relags, **tolerances)
     world = ipc.World(bodies, settings, device="cpu")
     world.set_velocity("a", (1.0, 0.0, 0.0))
     mass = 0.02**3 * 1000
@@ -124,11 +123,11 @@ def test_a_velocity_that_is_set_is_kept() -> None:
 
 
 def test_collision_keeps_momentum_and_energy_never_rises() -> None:
-    """Both hold to rounding at a tight tolerance; at a coarse one both fail, so the measure does measure."""
+    """Both hold to rounding at a tight tolerance; at a coarse one, with friction that is not renewed, both fail: the measure does measure."""
     drift, rise = collide(1e-11, 1e-8)
     assert drift < 1e-8, f"momentum drifted by {drift:.3g} of that of the moving cube"
     assert rise <= 1e-12, f"energy rose by {rise:.3g} of itself"
-    drift, rise = collide(1e-2, 0.1)
+    drift, rise = collide(1e-2, 0.1, relags=0)
     assert drift > 1e-5 and rise > 1e-7
 
 

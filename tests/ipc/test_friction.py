@@ -113,9 +113,13 @@ def test_coulomb_binds_where_a_block_lands_on_a_turning_table(offset: float, spe
 
 
 def test_a_step_whose_friction_does_not_settle_says_so() -> None:
-    world = block_over_table(friction_relags=1)
-    world.set_target("table", rotation=(np.cos(0.25), 0.0, 0.0, np.sin(0.25)))
-    assert not world.step().converged[0]
+    world, settled = block_over_table(friction_relags=2), []
+    for k in range(1, 7):
+        world.set_target("table", rotation=(np.cos(0.25 * k), 0.0, 0.0, np.sin(0.25 * k)))
+        settled.append(bool(world.step().converged[0]))
+        force = world.wrench("block").force[0]
+        assert not settled[-1] or np.hypot(force[0], force[1]) <= 1.01 * MU * force[2]
+    assert not all(settled)
 
 
 def sheared_pad(num_envs: int = 1, **settings: object) -> ipc.World:

@@ -117,6 +117,17 @@ def test_friction_is_coulombs():
     assert abs(state.shear_force[0, 0]) < 0.05 * state.normal_force[0]  # facets of a millimetre plough
 
 
+def test_a_hold_keeps_the_shear():
+    """While nothing moves the contact forgets nothing, though each state came in a few steps of the solver."""
+    pad = uncorrected(press(indent(0.8e-3), StageSpec("shear", shear=(0.2e-3, 0.0))))
+    state = pad.peak(pad.run())
+    assert pad.solver is not None and state.shear_force[0, 0] > 0.1 * state.normal_force[0]
+    poses = pad.solver.scene.pose("object")
+    for _ in range(20):
+        assert not pad.solver.step(poses).any()
+    assert pad.solver.forces()[0, :, 0].sum() == pytest.approx(state.shear_force[0, 0], rel=0.01)
+
+
 def test_twist_turns_with_the_object():
     pad = soft(press(indent(0.4e-3), StageSpec("twist", twist=math.radians(4.0)), kind="cylinder"))
     state = pad.peak(pad.run())
