@@ -60,7 +60,7 @@ def landing(relags: int) -> None:
             if report.converged[0]:
                 ratios.append(float(np.hypot(force[0], force[1]) / force[2]))
         worst = f"{max(ratios):.3f}" if ratios else "-"
-        print(f"landing at {speed:g} rad/s, μ = {mu}: at most {worst}, {newton} Newton iterations, {unconverged} of 6 unconverged")
+        print(f"landing at {speed:g} rad/s, μ = {mu}: at most {worst}, {newton} Newton iterations, {unconverged} unconverged")
 
 
 def main() -> None:

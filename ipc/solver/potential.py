@@ -123,6 +123,11 @@ class Potential:
         """1/h² [1/s²]."""
         return 1.0 / (self.dt * self.dt)
 
+    @property
+    def friction_eps(self) -> float:
+        """ε [m]."""
+        return self.settings.friction_slip
+
     def set_dt(self, dt: float) -> None:
         """Let the next steps be ``dt`` [s] long."""
         if dt != self.dt:
@@ -190,7 +195,7 @@ class Potential:
     def touch(self, active: wp.array) -> None:
         """Contacts, their forces and rows at x."""
         self.collision.assemble(
-            *(self.x, self.x_start, self.R, self.t, self.kappa, self.settings.friction_slip, active, self.vert_gradient, self.barrier)
+            *(self.x, self.x_start, self.R, self.t, self.kappa, self.friction_eps, active, self.vert_gradient, self.barrier)
         )
 
     def assemble(self, active: wp.array) -> None:
@@ -233,7 +238,7 @@ class Potential:
         self.launch(dynamics.inertia_change, self.y.shape, inputs, [self.node_change])
         self.reduce(self.node_change, active, SUM, change)
         self.collision.energy_change(
-            *(self.x, self.x1, self.x_start, self.R, self.t, self.kappa, self.settings.friction_slip, active, change)
+            *(self.x, self.x1, self.x_start, self.R, self.t, self.kappa, self.friction_eps, active, change)
         )
 
     def slope(self, active: wp.array, slope: wp.array, noise: wp.array) -> None:

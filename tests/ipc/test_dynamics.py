@@ -123,7 +123,7 @@ def test_a_velocity_that_is_set_is_kept() -> None:
 
 
 def test_collision_keeps_momentum_and_energy_never_rises() -> None:
-    """Both hold to rounding at a tight tolerance; at a coarse one, with friction that is not renewed, both fail: the measure does measure."""
+    """Both hold to rounding at a tight tolerance; at a coarse one, friction not renewed, both fail, so the measure does measure."""
     drift, rise = collide(1e-11, 1e-8)
     assert drift < 1e-8, f"momentum drifted by {drift:.3g} of that of the moving cube"
     assert rise <= 1e-12, f"energy rose by {rise:.3g} of itself"

@@ -126,7 +126,8 @@ class Mechanics:
         """Take in one step; one that has not converged is only gone over."""
         before, self._motion = self._motion, self._motions()
         energy = float(report.kinetic[0] + report.elastic[0] + report.barrier[0]) + self._potential()
-        stored = 2 / 3 * self._world.settings.friction_slip * self._world.settings.friction * float(self._world.contacts().force.sum())
+        settings, normal = self._world.settings, float(self._world.contacts().force.sum())
+        stored = 2 / 3 * settings.friction_slip * settings.friction * normal
         rise, self._energy = energy - self._energy - max(stored, self._stored), energy
         self._stored = stored
         self._kinetic = max(self._kinetic, float(report.kinetic[0]))

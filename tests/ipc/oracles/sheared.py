@@ -58,7 +58,7 @@ class Sheared:
         """Tangential over normal force after each step of a straight move by ``distance`` [m] along x."""
         start, shares = self.world.frame("ball")[1][0], []
         for k in range(1, steps + 1):
-            self.world.set_target("ball", start + [distance * k / steps, 0.0, 0.0])
+            self.world.set_target("ball", start + distance * k / steps * np.array([1.0, 0.0, 0.0]))
             self._step()
             force = self.world.wrench("ball").force[0]
             shares.append(-force[0] / force[2])
