@@ -139,8 +139,8 @@ class PressControl(_Settings):
     A barrier's pressure is bounded while surfaces keep apart, and few small facets carry the force."""
     stiffenings: int = 4
     """Most such increases in one step."""
-    friction_tolerance: float = 0.01
-    """Share by which the normal forces that bound friction may be off in a solved step."""
+    friction_tolerance: float = 1e-3
+    """Share by which the normal forces that bound friction may be off in a solved step; a search for a force needs it to be small."""
     depth_tolerance: float = 1e-6
     """A depth is reached within this [m]."""
     force_tolerance: float = 5e-4
