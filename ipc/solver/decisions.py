@@ -319,7 +319,7 @@ def conclude(tolerance: wp.float64, max_newton: wp.int32, max_relags: wp.int32, 
         d.active[env] = 0
     # Where Newton gave up, forces are no better known after another lag; the first two may still help it on.
     if was_active != 0 and d.active[env] == 0 and friction != 0 and max_relags > 0:
-        if d.converged[env] != 0 or d.relags[env] < wp.min(2, max_relags):
+        if d.converged[env] != 0 or (d.relags[env] < 2 and d.relags[env] < max_relags):
             d.pending[env] = 1
 
 

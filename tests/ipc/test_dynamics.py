@@ -84,7 +84,7 @@ def collide(velocity_tolerance: float, linear_tolerance: float, relags: int = 30
         ipc.SoftBody("a", a, ipc.Material(1e5, 0.4)),
         ipc.SoftBody("b", ipc.TetMesh(b.vertices + np.array([0.023, 0.006, 0.004]), b.tets), ipc.Material(2e5, 0.4)),
     ]
-    tolerances = {"velocity_tolerance": velocity_tolerance, "linear_tolerance": linear_tolerance}
+    tolerances: dict = {"velocity_tolerance": velocity_tolerance, "linear_tolerance": linear_tolerance}
     settings = ipc.Settings(dt=2e-3, d_hat=1e-3, friction=0.3, friction_relags=relags, **tolerances)
     world = ipc.World(bodies, settings, device="cpu")
     world.set_velocity("a", (1.0, 0.0, 0.0))

@@ -107,7 +107,7 @@ class Contact:
         """
         k, limit, share = 8 * SOLID.shear * self.radius / (2 - SOLID.poisson), MU * self.load, np.linspace(0.0, 1.0, 2001)
         u = 1.5 * limit / k * (1 - (1 - share) ** (2 / 3)) + limit * share * (1 / self.shear - 1 / k)
-        return np.interp(distance, u, share)
+        return np.interp(np.asarray(distance, float), u, share)
 
     def turned(self, angle: ArrayLike) -> Floats:
         """M over that of full slip, 3π/16 μPa, at angles [rad], in series as ``pulled``.
@@ -122,7 +122,7 @@ class Contact:
         steps = np.diff(lubkin) * ((s[1:] + s[:-1]) / 2 * a) ** 3
         torque = 16 / 3 * SOLID.shear * np.concatenate([[0.0], np.cumsum(steps)])
         beta = lubkin + torque * (1 / self.twist - 3 / (16 * SOLID.shear * a**3))
-        return np.interp(angle, beta, torque / (FULL_TWIST * limit * a))
+        return np.interp(np.asarray(angle, float), beta, torque / (FULL_TWIST * limit * a))
 
 
 def sticking(cells: int = 3, reach: float = 6.0) -> Contact:
