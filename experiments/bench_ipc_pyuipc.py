@@ -3,13 +3,13 @@
     python experiments/bench_ipc_pyuipc.py --out runs/bench_ipc_pyuipc                     # needs CUDA and pyuipc 0.0.29
     python experiments/bench_ipc_pyuipc.py --backend none --cases 300,300x3 --out runs/x   # builds the scenes, computes nothing
 
-The scene of ``bench_ipc.py``: same mesh, sphere, drive, time step, d̂, μ, ε_v and velocity tolerance; small-strain moduli are matched (a
+The scene of ``bench_ipc.py``: same mesh, sphere, drive, time step, d̂, μ and velocity tolerance; small-strain moduli are matched (a
 cube is stretched first to see which energy pyuipc uses); its semi-implicit early stop is off; the first step is left out. What differs:
 
 - the base is held by ``is_fixed`` (exact, as here), but the sphere is an affine body on a stiff spring (``SoftTransformConstraint``);
   the metrics tell how far it lags behind;
 - the barrier is weighed by no area: ``--kappa`` is a stiffness by pair; its effect is the stand-off and shows in the force;
-- friction is renewed once a step, here up to twice more;
+- friction is renewed once a step, of no memory, and creeps at ε_v; here it is renewed until it settles, with an elastic slip of ε_v dt;
 - 128 environments are 128 pads in one scene, ``--spacing`` apart, that share one Newton loop and one linear system.
 
 Each case runs in a process of its own, so that one that crashes costs no other, and all stop when ``--budget-s`` is used up.

@@ -124,11 +124,17 @@ def peg_world(num_envs: int, device: str, cuda_graph: bool = True) -> ipc.World:
     """Two pads of 140 vertices, a free peg between them and, below it, a block with a hole that is off the peg's axis.
 
     As in the peg scene of Taccel (two pads of 139 vertices and an affine peg; h = 20 ms, d̂ = 0.1 mm, tolerance 1e-3 m/s; at most 20
-    Newton and 40 PCG iterations, where here every step converges); meshes and motion are ours. ε_v is the velocity tolerance: friction
-    that is resolved finer than the rest is stiff for nothing.
+    Newton and 40 PCG iterations, where here every step converges); meshes and motion are ours. the elastic slip is what
+    the velocity tolerance leaves open in a step: friction that is resolved finer than the rest is stiff for nothing.
     """
+    tolerance = 1e-3
     settings = ipc.Settings(
-        dt=PEG_DT, d_hat=D_HAT, friction=FRICTION, velocity_tolerance=1e-3, friction_velocity=1e-3, cuda_graph=cuda_graph
+        dt=PEG_DT,
+        d_hat=D_HAT,
+        friction=FRICTION,
+        velocity_tolerance=tolerance,
+        friction_slip=tolerance * PEG_DT,
+        cuda_graph=cuda_graph,
     )
     mesh = ipc.domed_pad(PEG_PAD, PEG_THICKNESS, (math.inf, math.inf), PEG_CELLS, cut="alike")
     base = ipc.vertices_in_box(mesh, (-1, -1, -PEG_THICKNESS), (1, 1, -PEG_THICKNESS))

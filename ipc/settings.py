@@ -21,9 +21,11 @@ class Settings:
         d_hat: distance below which surfaces repel [m]; None: 0.1 of the shortest edge on the deformable surfaces.
         kappa: barrier stiffness κ [Pa]; None: the largest Young's modulus of the soft bodies (1e5 Pa without one).
         friction: default coefficient μ [-] of every pair of bodies (``World`` takes exceptions by name).
-        friction_velocity: ε_v [m/s]; below this sliding speed friction grows smoothly from zero.
-        friction_relags: number of times that a step may renew the lagged normal forces and tangents after its first solve.
-        friction_tolerance: a step renews them until the friction force changed by less than this fraction [-].
+        friction_slip: ε [m]; the elastic slip at which a contact yields: friction grows smoothly from zero to its limit over this way,
+            and is remembered. Contacts are softer to shear by 2μλ/ε in series, so ε is to be small against the motions of interest.
+        friction_relags: number of times that a step may renew the normal forces and tangents that bound friction after its first solve;
+            a step that still changes them then has not converged. 0: they are those at the start of the step, unchecked.
+        friction_tolerance: a step renews them until they change by less than this fraction [-].
         linear_tolerance: relative residual ‖r‖/‖g‖ of the linear solve [-].
         max_linear: PCG iterations a solve.
         preconditioner: of PCG: ``"block_jacobi"``, ``"rest_inverse"`` (bonded bodies' rest matrix inverted once, contacts as a low-rank
@@ -52,8 +54,8 @@ class Settings:
     d_hat: float | None = None
     kappa: float | None = None
     friction: float = 0.0
-    friction_velocity: float = 1e-4
-    friction_relags: int = 2
+    friction_slip: float = 1e-6
+    friction_relags: int = 30
     friction_tolerance: float = 0.01
     linear_tolerance: float = 1e-2
     max_linear: int = 2000
@@ -71,7 +73,7 @@ class Settings:
     deterministic: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("dt", "velocity_tolerance", "friction_velocity", "linear_tolerance", "friction_tolerance"):
+        for name in ("dt", "velocity_tolerance", "friction_slip", "linear_tolerance", "friction_tolerance"):
             if not getattr(self, name) > 0:
                 raise IpcError(f"{name} = {getattr(self, name)}: it must be positive")
         if len(self.gravity) != 3 or not all(isfinite(g) for g in self.gravity):

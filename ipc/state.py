@@ -24,6 +24,8 @@ class State:
         frame_rotation, frame_position: frames of bodies, grips and aims, quaternion (w, x, y, z) (B, frames, 4) and [m] (B, frames, 3).
         kappa: [Pa] (B,).
         failed: (B,).
+        stuck: pairs that remember a slip: four vertices, −1 unused, and the body pair, all −1 without a pair, (B, C, 5).
+        slip: their elastic slips, world frame [m] (B, C, 3).
     """
 
     y: Floats
@@ -32,6 +34,8 @@ class State:
     frame_position: Floats
     kappa: Floats
     failed: NDArray[np.bool_]
+    stuck: NDArray[np.int32]
+    slip: Floats
 
 
 def start_state(layout: Layout, num_envs: int, kappa: float) -> State:
@@ -45,6 +49,8 @@ def start_state(layout: Layout, num_envs: int, kappa: float) -> State:
         frame_position=np.broadcast_to(frames[:, :3], (num_envs, len(frames), 3)).copy(),
         kappa=np.full(num_envs, kappa),
         failed=np.zeros(num_envs, bool),
+        stuck=np.zeros((num_envs, 0, 5), np.int32),
+        slip=np.zeros((num_envs, 0, 3)),
     )
 
 
@@ -59,7 +65,7 @@ def teleported(
 ) -> NDArray[np.bool_]:
     """Move a frame, and all that is bonded to it, in the environments of the mask.
 
-    Changes ``state``; velocities become zero.
+    Changes ``state``; velocities become zero, and contacts of the body forget their slip.
 
     Args:
         body: owner of the frame.
@@ -83,6 +89,8 @@ def teleported(
         turned = np.einsum("bij,nj->bni", rotation_matrix(state.frame_rotation[:, frame]), layout.aim_local[nodes])
         state.y[mask, nodes] = (turned + state.frame_position[:, frame, None])[mask]
     state.velocity[mask, nodes] = 0.0
+    touched = (state.stuck[..., 0] >= 0) & (layout.pairs[state.stuck[..., 4]] == index).any(axis=-1)
+    state.stuck[mask[:, None] & touched] = -1
     return moved
 
 

@@ -306,6 +306,7 @@ class World:
     def save(self) -> State:
         """A copy of the state of every environment."""
         s = self._potential
+        stuck, slip = s.collision.slips()
         return State(
             y=host(s.y).copy(),
             velocity=host(s.v).copy(),
@@ -313,12 +314,14 @@ class World:
             frame_position=host(s.frame_p).copy(),
             kappa=host(s.kappa).copy(),
             failed=self._failed.copy(),
+            stuck=stuck,
+            slip=slip,
         )
 
     def restore(self, state: State, envs: ArrayLike | None = None) -> None:
         """Put environments back to a saved state; targets become the frames of that state.
 
-        Forces and contacts belong to a step, not to a state: there are none until the next one.
+        Forces and contacts belong to a step, not to a state: there are none until the next one. What friction remembers is in the state.
 
         Args:
             state: from :meth:`save` of a world of the same bodies.
@@ -353,6 +356,8 @@ class World:
             self._failed[mask] = state.failed[mask]
             s.collision.forget(mask)
             s.collision.drop(mask)
+            if s.collision.friction and s.collision.set_slips(state.stuck, state.slip, mask):
+                self._newton.forget_recordings()
             for forces in (s.gradient, s.vert_gradient):
                 kept = host(forces).copy()
                 kept[mask] = 0.0

@@ -114,14 +114,25 @@ class Collision:
         self._size_candidates(512, 1024)
         self.contacts = contacts.Contacts()
         self.contacts.count, self.contacts.row_count = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
-        self.lagged, self._old = friction.Lagged(), friction.Lagged()
-        self.lagged.count, self._old.count = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
+        self.lagged, self._old, self.memory = friction.Lagged(), friction.Lagged(), friction.Memory()
+        for pairs in (self.lagged, self._old, self.memory):
+            pairs.count = wp.zeros(batch, dtype=wp.int32, device=device)
+        self.lagged.fresh, self._old.fresh = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
+        self._index = friction.Index()
+        framed = layout.frame_moves[:bodies] == 1
+        soft = np.diff(layout.node_start) > 0
+        # Slips turn with the second body of a pair, but rather with a rigid one, or else with one that has a frame.
+        rank = 2 * (framed & ~soft) + (framed & soft)
+        first, second = layout.pairs.T
+        values = {"framed": framed, "node_start": layout.node_start, "body": np.where(rank[first] > rank[second], first, second)}
+        self._turning = filled(friction.Turning, device, values)
+        self._turning.turn = wp.zeros((batch, bodies), dtype=wp.mat33d, device=device)
         self._size_contacts(256, 768)
         self.overflow = wp.zeros(1, dtype=wp.int32, device=device)
         self._any_stale = wp.zeros(1, dtype=wp.int32, device=device)
         self._change = wp.zeros((batch, verts), dtype=wp.vec3d, device=device)
         self._change_size = wp.zeros((batch, verts), dtype=wp.float64, device=device)
-        self._force = wp.zeros(batch, dtype=wp.float64, device=device)
+        self._force = wp.zeros((batch, 2), dtype=wp.float64, device=device)
         self._reduce = Reducer(batch, max(1, verts), device)
         self._reduce.prepare(verts)
         self._boxes.low.fill_(wp.vec3d(1.0, 1.0, 1.0))  # an empty box (low above high): the first check builds a list
@@ -133,24 +144,26 @@ class Collision:
         self._ordered = {n: wp.zeros((self.batch, n), dtype=wp.vec3i, device=self.device) for n in (pt, ee) if self._sort}
 
     def _size_contacts(self, pairs: int, rows: int) -> None:
-        for name, dtype in {
-            **{"verts": wp.vec4i, "coef": wp.vec4d, "normal": wp.vec3d},
-            **{"force": wp.float64, "gap": wp.float64, "pair": wp.int32},
-        }.items():
-            setattr(self.contacts, name, wp.zeros((self.batch, pairs), dtype=dtype, device=self.device))
-        self.contacts.row_verts = wp.zeros((self.batch, rows), dtype=wp.vec4i, device=self.device)
-        self.contacts.row = wp.zeros((self.batch, rows), dtype=contacts.mat34d, device=self.device)
-        fields = {"verts": wp.vec4i, "coef": wp.vec4d, "normal": wp.vec3d, "limit": wp.float64, "pair": wp.int32}
+        place = {"verts": wp.vec4i, "coef": wp.vec4d, "normal": wp.vec3d, "pair": wp.int32}
+        self._resize(self.contacts, place | {"force": wp.float64, "gap": wp.float64}, pairs)
+        self._resize(self.contacts, {"row_verts": wp.vec4i, "row": contacts.mat34d}, rows)
         room = pairs if self.friction else 1
-        for lagged in (self.lagged, self._old):
-            for name, dtype in fields.items():
-                new = wp.zeros((self.batch, room), dtype=dtype, device=self.device)
-                before = getattr(lagged, name)
-                if before is not None:
-                    values = new.numpy()
-                    values[:, : min(room, before.shape[1])] = before.numpy()[:, :room]
-                    new.assign(values)
-                setattr(lagged, name, new)
+        for lagged in (self.lagged, self._old):  # contacts, and as many that have gone
+            fields = place | {"limit": wp.float64, "slip": wp.vec3d, "turn": wp.mat33d, "swing": wp.vec3d}
+            self._resize(lagged, fields, 2 * room)
+        self._resize(self.memory, {"verts": wp.vec4i, "pair": wp.int32, "slip": wp.vec3d}, room)
+        self._resize(self._index, {"first": wp.int32, "next": wp.int32}, 2 * room)
+
+    def _resize(self, struct: Any, fields: dict[str, Any], room: int) -> None:
+        """Give arrays of a struct another second dimension; what they hold is kept."""
+        for name, dtype in fields.items():
+            new = wp.zeros((self.batch, room), dtype=dtype, device=self.device)
+            before = getattr(struct, name)
+            if before is not None:
+                values, both = new.numpy(), min(room, before.shape[1])
+                values[:, :both] = before.numpy()[:, :both]
+                new.assign(values)
+            setattr(struct, name, new)
 
     def grow(self) -> None:
         """Make room for twice what did not fit; new lists are made at the next check."""
@@ -292,21 +305,84 @@ class Collision:
 
     # --- friction --------------------------------------------------------------------------------------------------------------
 
-    def lag(self, active: wp.array, changed: wp.array) -> None:
-        """Freeze active contacts for friction; ``changed`` (B,): relative change of limits μ λ n."""
+    def measure_from(self, x: wp.array, y: wp.array, frame_q: wp.array, goal_q: wp.array) -> None:
+        """Say where vertices (B, V), nodes (B, N), frames (B, frames) of the start of a step are kept, and the frames' goals."""
+        self._turning.x, self._turning.y, self._turning.frame_q, self._turning.goal_q = x, y, frame_q, goal_q
+
+    def lag(self, relags: wp.array, active: wp.array, changed: wp.array, sum_changed: wp.array) -> None:
+        """Freeze active contacts for friction.
+
+        Args:
+            relags: −1 at the start of a step (B,).
+            active: mask (B,).
+            changed, sum_changed: become the relative change of the limits μ λ n at the vertices, and of their sum (B,).
+        """
+        self._launch(friction.turns_ahead, self._turning.turn.shape, [self._turning, active], [self._turning.turn])
         limits, vertices = self.lagged.limit.shape, self._change.shape
         self._launch(friction.keep_lagged, limits, [self.lagged, active], [self._old])
-        self._launch(friction.lag_contacts, limits, [self.contacts, self.pair_mu, active], [self.lagged])
+        self._fill_index(self.memory, active)
+        inputs = [self._turning, self.contacts, self.memory, self._index, self.pair_mu, relags, active]
+        self._launch(friction.lag_contacts, limits, inputs, [self.lagged])
         self._launch(friction.clear_change, vertices, [active], [self._change, self._force, changed])
         for lagged, sign in ((self.lagged, 1.0), (self._old, -1.0)):
             self._each(friction.lag_difference, [lagged, sign, active], [self._change, self._force])
         self._launch(friction.size_of_change, vertices, [self._change, active], [self._change_size])
         self._reduce(self._change_size, active, SUM, changed)
-        self._launch(friction.share_of_change, self.batch, [self._force, active], [changed])
+        self._launch(friction.share_of_change, self.batch, [self._force, active], [changed, sum_changed])
+
+    def average(self, share: wp.array, active: wp.array) -> None:
+        """Let only a ``share`` (B,) of the limits be those of the last ``lag``, and the rest those before it."""
+        self._launch(friction.weigh_fresh, self.lagged.limit.shape, [share, active], [self.lagged])
+        self._fill_index(self.lagged, active)
+        self._each(friction.add_old, [self._old, share, self._index, active], [self.lagged])
+
+    def remember(self, x: wp.array, y: wp.array, R: wp.array, friction_slip: float, active: wp.array) -> None:
+        """Elastic slips of the contacts at the end of a step, for the next one.
+
+        Args:
+            x, y, R: vertices (B, V), nodes (B, N) and frames (B, frames) that the contacts belong to.
+            friction_slip: ε [m].
+            active: mask (B,).
+        """
+        self._launch(friction.turns, self._turning.turn.shape, [self._turning, y, R, active], [self._turning.turn])
+        self._fill_index(self.lagged, active)
+        inputs = [x, self._turning, self.contacts, self.lagged, self._index, friction_slip, active]
+        self._launch(friction.remember, self.memory.slip.shape, inputs, [self.memory])
+
+    def _fill_index(self, pairs: Any, active: wp.array) -> None:
+        self._launch(friction.clear_index, self._index.first.shape, [active], [self._index])
+        self._launch(friction.fill_index, self._index.first.shape, [pairs.verts, pairs.count, active], [self._index])
 
     def drop(self, envs: np.ndarray) -> None:
-        """Forget the contacts and the lagged pairs of the environments of the mask (B,)."""
-        for counts in (self.contacts.count, self.contacts.row_count, self.lagged.count):
+        """Forget the contacts, the lagged pairs and the slips of the environments of the mask (B,)."""
+        for counts in (self.contacts.count, self.contacts.row_count, self.lagged.count, self.memory.count):
             count = counts.numpy()
             count[envs] = 0
             counts.assign(count)
+
+    def slips(self) -> tuple[np.ndarray, np.ndarray]:
+        """What :meth:`remember` keeps: vertices and body pair, −1 unused (B, C, 5), and elastic slip [m] (B, C, 3)."""
+        memory = self.memory
+        count = memory.count.numpy()
+        used = np.arange(count.max(initial=0)) < count[:, None]
+        verts, pair, slip = (a.numpy()[:, : used.shape[1]] for a in (memory.verts, memory.pair, memory.slip))
+        keys = np.concatenate([verts, pair[..., None]], axis=2)
+        return np.where(used[..., None], keys, -1), np.where(used[..., None], slip, 0.0)
+
+    def set_slips(self, pairs: np.ndarray, slip: np.ndarray, envs: np.ndarray) -> bool:
+        """Set, in the environments of the mask (B,), what :meth:`slips` returns; True if buffers had to grow for it."""
+        used = pairs[..., 0] >= 0
+        counts = used.sum(axis=1)
+        most = int(counts[envs].max(initial=0))
+        grows = most > self.memory.slip.shape[1]
+        if grows:
+            self._size_contacts(most, self.contacts.row.shape[1])
+        memory = self.memory
+        count, verts, pair, slips = (a.numpy().copy() for a in (memory.count, memory.verts, memory.pair, memory.slip))
+        for env in np.flatnonzero(envs):
+            n, here = counts[env], used[env]
+            count[env] = n
+            verts[env, :n], pair[env, :n], slips[env, :n] = pairs[env, here, :4], pairs[env, here, 4], slip[env, here]
+        for target, values in ((memory.count, count), (memory.verts, verts), (memory.pair, pair), (memory.slip, slips)):
+            target.assign(values)
+        return grows

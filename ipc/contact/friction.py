@@ -1,12 +1,27 @@
-"""Lagged Coulomb friction (Li et al. 2020, section 5).
+"""Coulomb friction with an elastic slip that contacts remember.
 
-With the normal force λ, the normal n and the closest points c_i of an earlier iterate held fixed, a pair stores μ λ f0(‖u‖), where
-u = (1 − n nᵀ) Σ c_i (x_i − x_i^start) is its sliding since the start of the step and ε = ε_v h:
+A pair of primitives has an anchor and an elastic slip w: the tangential displacement of the closest points since the anchor. Its
+tangential force is μ λ f1(‖w‖) ŵ, with the normal force λ, the normal n and the closest points c_i of an earlier iterate held fixed
+(lagged; Li et al. 2020, section 5) and their mollifier as the law of a spring that yields at ‖w‖ = ε:
 
+    w = z + (1 − n nᵀ) Σ c_i (x_i − x_i^start),    E = μ λ f0(‖w‖),
     f0(y) = y²/ε − y³/(3 ε²) + ε/3 for y < ε, else y;    f1 = f0' = 2y/ε − y²/ε² or 1.
 
-The Hessian μ λ [(f1/y)(1 − û ûᵀ) + f1' û ûᵀ] has no negative eigenvalue: two rows, along û and across it. Below the threshold a pair
-under the tangential load r μ λ creeps at ε_v (1 − √(1 − r)).
+z is the elastic slip at the start of the step. At its end the return mapping z ← w min(1, ε/‖w‖) moves the anchor of the pairs that slip,
+and of no others. This is plasticity with the yield surface ‖force‖ = μ λ (Simo, Laursen 1992, "An augmented Lagrangian treatment of
+contact problems involving friction", section 3); that E is linear beyond ε makes its gradient that mapping's force. While nothing
+moves, nothing is forgotten, in any number of steps. The Hessian μ λ [(f1/y)(1 − ŵ ŵᵀ) + f1' ŵ ŵᵀ] has no negative eigenvalue: two rows,
+along ŵ and across it.
+
+*What remembers.* Pairs do, known by their vertices: point and triangle, two edges, point and plane. Pairs within d̂ come and go with the
+barrier's force, so a new one begins with no slip and hardly a force, and one that has left is forgotten. Slip kept at vertices would have
+to be averaged from the pairs and back in each step, which smooths the tractions away; pairs keep it to the last bit. Where a contact
+slides or rolls on to other primitives, what is lost is at most a slip of ε. Pairs are found by a hash of their vertices. Where two slots
+of it collide, the lowest index wins, so nothing depends on scheduling.
+
+*Frames.* z turns with one of the two bodies, the one that a frame carries if there is one, so that bodies which turn together keep their
+stress. The same turn Q moves the closest points, a gap d apart, by d (n − Qᵀ n) without any slip, which is taken off. In the step it is the
+turn that the frame is ordered to make, so that all its lags agree; what bodies without a frame turn counts at its end.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -16,7 +31,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, VecArray2d
+from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, MatArray2d, QuatArray2d, VecArray2d
 from ipc.contact.contacts import Contacts, push_row
 
 wp.set_module_options({"enable_backward": False})
@@ -24,14 +39,60 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Lagged:
-    """The pairs whose normal force is held fixed; ``limit`` is μ λ [N]."""
+    """The pairs whose normal force is held fixed: ``fresh`` ones, from the contacts, and such as an average with older ones kept.
+
+    ``limit`` is μ λ [N], ``slip`` the part of w that the step does not change [m], ``turn`` Q over the step as it was known at the lag,
+    and ``swing`` what the gap turned by it [m].
+    """
 
     verts: wp.array2d(dtype=wp.vec4i)
     coef: wp.array2d(dtype=wp.vec4d)
     normal: VecArray2d
     limit: FloatArray2d
     pair: IntArray2d
+    slip: VecArray2d
+    turn: MatArray2d
+    swing: VecArray2d
     count: IntArray
+    fresh: IntArray
+
+
+@wp.struct
+class Memory:
+    """Elastic slips z [m] at the start of the step, world frame, by pair."""
+
+    verts: wp.array2d(dtype=wp.vec4i)
+    pair: IntArray2d
+    slip: VecArray2d
+    count: IntArray
+
+
+@wp.struct
+class Index:
+    """A hash of pairs by their vertices: the first entry of each slot and the next of each entry, −1 for none."""
+
+    first: IntArray2d
+    next: IntArray2d
+
+
+@wp.struct
+class Turning:
+    """How far bodies have turned since the start of the step.
+
+    Attributes:
+        x, y: vertices (B, V) and nodes (B, N) at the start [m].    frame_q, goal_q: frames at the start and at the end (B, frames).
+        framed: 1 where a body's frame carries it (bodies,).    node_start: first node of each body and the total.
+        body: the body that each body pair's slips turn with (P,).    turn: Q of each body (B, bodies).
+    """
+
+    x: VecArray2d
+    y: VecArray2d
+    frame_q: QuatArray2d
+    goal_q: QuatArray2d
+    framed: IntArray
+    node_start: IntArray
+    body: IntArray
+    turn: MatArray2d
 
 
 @wp.func
@@ -68,6 +129,120 @@ def sliding(x: VecArray2d, start: VecArray2d, env: wp.int32, verts: wp.vec4i, c:
     return u - wp.dot(u, n) * n
 
 
+@wp.func
+def rotation_in(A: wp.mat33d) -> wp.mat33d:
+    """The rotation nearest to A, from the identity on (Müller et al. 2016, "A Robust Method to Extract the Rotational Part")."""
+    R = wp.identity(n=3, dtype=wp.float64)
+    for _ in range(30):
+        turn, size = wp.vec3d(), wp.float64(0.0)
+        for k in range(3):
+            r, a = wp.vec3d(R[0, k], R[1, k], R[2, k]), wp.vec3d(A[0, k], A[1, k], A[2, k])
+            turn += wp.cross(r, a)
+            size += wp.dot(r, a)
+        angle = wp.length(turn)
+        if angle <= wp.float64(1.0e-15) * wp.abs(size) or size == wp.float64(0.0):
+            break
+        R = wp.quat_to_matrix(wp.quat_from_axis_angle(turn / angle, angle / wp.abs(size))) * R
+    return R
+
+
+@wp.kernel
+def turns_ahead(turning: Turning, active: IntArray, turn: MatArray2d):
+    """Q of every body over the whole step as its frame is to move; 1 where no frame carries it."""
+    env, body = wp.tid()
+    if active[env] == 0:
+        return
+    turn[env, body] = wp.identity(n=3, dtype=wp.float64)
+    if turning.framed[body] != 0:
+        end, start = turning.goal_q[env, body], turning.frame_q[env, body]
+        turn[env, body] = wp.quat_to_matrix(end) * wp.transpose(wp.quat_to_matrix(start))
+
+
+@wp.kernel
+def turns(turning: Turning, y: VecArray2d, R: MatArray2d, active: IntArray, turn: MatArray2d):
+    """Q of every body from the start of the step to y and R; of up to 256 nodes where no frame carries it."""
+    env, body = wp.tid()
+    if active[env] == 0:
+        return
+    if turning.framed[body] != 0:
+        turn[env, body] = R[env, body] * wp.transpose(wp.quat_to_matrix(turning.frame_q[env, body]))
+        return
+    first, last = turning.node_start[body], turning.node_start[body + 1]
+    step = wp.max((last - first) / 256, 1)
+    centre, before, count = wp.vec3d(), wp.vec3d(), wp.float64(0.0)
+    for i in range(first, last, step):
+        centre += y[env, i]
+        before += turning.y[env, i]
+        count += wp.float64(1.0)
+    A = wp.mat33d()
+    for i in range(first, last, step):
+        A += wp.outer(y[env, i] - centre / count, turning.y[env, i] - before / count)
+    turn[env, body] = rotation_in(A)
+
+
+@wp.func
+def in_tangent_plane(z: wp.vec3d, n: wp.vec3d) -> wp.vec3d:
+    """z turned into the plane across n; its length is kept."""
+    flat = z - wp.dot(z, n) * n
+    length = wp.length(flat)
+    if length > wp.float64(0.0):
+        return (wp.length(z) / length) * flat
+    return flat
+
+
+@wp.func
+def slot_of(verts: wp.vec4i, slots: wp.int32) -> wp.int32:
+    """Slot of a pair in the hash."""
+    key = wp.uint32(0)
+    for k in range(4):
+        key = wp.uint32(1000003) * key + wp.uint32(verts[k])
+    return wp.int32(key % wp.uint32(slots))
+
+
+@wp.func
+def find_pair(
+    index: Index, verts: wp.array2d(dtype=wp.vec4i), pairs: IntArray2d, env: wp.int32, v: wp.vec4i, pair: wp.int32
+) -> wp.int32:
+    """Entry of a pair, −1 without one. Two edges of a body may have the vertices of a point and a triangle; the lowest entry counts."""
+    found = wp.int32(-1)
+    k = index.first[env, slot_of(v, index.first.shape[1])]
+    while k >= 0:
+        u = verts[env, k]
+        if u[0] == v[0] and u[1] == v[1] and u[2] == v[2] and u[3] == v[3] and pairs[env, k] == pair:
+            if found < 0 or k < found:
+                found = k
+        k = index.next[env, k]
+    return found
+
+
+@wp.kernel
+def clear_index(active: IntArray, index: Index):
+    env, i = wp.tid()
+    if active[env] != 0:
+        index.first[env, i] = -1
+
+
+@wp.kernel
+def fill_index(verts: wp.array2d(dtype=wp.vec4i), count: IntArray, active: IntArray, index: Index):
+    """Enters all pairs into the hash."""
+    env, i = wp.tid()
+    if active[env] != 0 and i < count[env]:
+        index.next[env, i] = wp.atomic_exch(index.first, env, slot_of(verts[env, i], index.first.shape[1]), i)
+
+
+@wp.func
+def copy_pair(pairs: Lagged, env: wp.int32, i: wp.int32, out: Lagged, k: wp.int32):
+    """Entry k of ``out`` becomes entry i of ``pairs``."""
+    out.verts[env, k] = pairs.verts[env, i]
+    out.coef[env, k] = pairs.coef[env, i]
+    out.normal[env, k] = pairs.normal[env, i]
+    out.limit[env, k] = pairs.limit[env, i]
+    out.pair[env, k] = pairs.pair[env, i]
+    out.slip[env, k] = pairs.slip[env, i]
+    out.turn[env, k] = pairs.turn[env, i]
+    out.swing[env, k] = pairs.swing[env, i]
+
+
 @wp.kernel
 def keep_lagged(lagged: Lagged, active: IntArray, out: Lagged):
     """Copies the lagged pairs of the active environments."""
@@ -76,27 +251,111 @@ def keep_lagged(lagged: Lagged, active: IntArray, out: Lagged):
         return
     if i == 0:
         out.count[env] = lagged.count[env]
+        out.fresh[env] = lagged.fresh[env]
     if i < lagged.count[env]:
-        out.verts[env, i] = lagged.verts[env, i]
-        out.coef[env, i] = lagged.coef[env, i]
-        out.normal[env, i] = lagged.normal[env, i]
-        out.limit[env, i] = lagged.limit[env, i]
+        copy_pair(lagged, env, i, out, i)
 
 
 @wp.kernel
-def lag_contacts(contacts: Contacts, mu: FloatArray, active: IntArray, out: Lagged):
-    """Freezes the contacts of the active environments."""
+def weigh_fresh(share: FloatArray, active: IntArray, out: Lagged):
+    """Multiplies the limits of the fresh pairs by their share."""
+    env, i = wp.tid()
+    if active[env] != 0 and i < out.fresh[env]:
+        out.limit[env, i] = share[env] * out.limit[env, i]
+
+
+@wp.kernel
+def add_old(old: Lagged, share: FloatArray, index: Index, active: IntArray, lanes: wp.int32, out: Lagged):
+    """Adds what the average has of the last lag's fresh pairs: to the same pair, or as one of its own where that has gone.
+
+    So no pair is kept beyond two lags, and there are never more than twice as many as contacts.
+    """
+    env, lane = wp.tid()
+    if active[env] == 0:
+        return
+    for i in range(lane, old.fresh[env], lanes):
+        limit = (wp.float64(1.0) - share[env]) * old.limit[env, i]
+        entry = find_pair(index, out.verts, out.pair, env, old.verts[env, i], old.pair[env, i])
+        if entry >= 0:
+            out.limit[env, entry] = out.limit[env, entry] + limit
+        elif limit > wp.float64(0.0):
+            entry = wp.atomic_add(out.count, env, 1)
+            copy_pair(old, env, i, out, entry)
+            out.limit[env, entry] = limit
+
+
+@wp.kernel
+def lag_contacts(
+    turning: Turning,
+    contacts: Contacts,
+    memory: Memory,
+    index: Index,
+    mu: FloatArray,
+    relags: IntArray,
+    active: IntArray,
+    # outputs
+    out: Lagged,
+):
+    """Freezes the contacts of the active environments, with what they remember; ``relags`` is −1 at the start of the step."""
     env, i = wp.tid()
     if active[env] == 0:
         return
     if i == 0:
         out.count[env] = wp.min(contacts.count[env], contacts.force.shape[1])
-    if i < contacts.count[env]:
-        out.verts[env, i] = contacts.verts[env, i]
-        out.coef[env, i] = contacts.coef[env, i]
-        out.normal[env, i] = contacts.normal[env, i]
-        out.limit[env, i] = mu[contacts.pair[env, i]] * contacts.force[env, i]
-        out.pair[env, i] = contacts.pair[env, i]
+        out.fresh[env] = out.count[env]
+    if i < wp.min(contacts.count[env], contacts.force.shape[1]):
+        verts, coef, n, pair = contacts.verts[env, i], contacts.coef[env, i], contacts.normal[env, i], contacts.pair[env, i]
+        turn = turning.turn[env, turning.body[pair]]
+        swing = contacts.gap[env, i] * (n - wp.transpose(turn) * n)
+        if relags[env] < 0:
+            swing = contacts.gap[env, i] * (turn * n - n)
+        slip = wp.dot(swing, n) * n - swing
+        entry = find_pair(index, memory.verts, memory.pair, env, verts, pair)
+        if entry >= 0:
+            slip += in_tangent_plane(turn * memory.slip[env, entry], n)
+        out.verts[env, i] = verts
+        out.coef[env, i] = coef
+        out.normal[env, i] = n
+        out.limit[env, i] = mu[pair] * contacts.force[env, i]
+        out.pair[env, i] = pair
+        out.slip[env, i] = slip
+        out.turn[env, i] = turn
+        out.swing[env, i] = swing
+
+
+@wp.kernel
+def remember(
+    x: VecArray2d,
+    turning: Turning,
+    contacts: Contacts,
+    lagged: Lagged,
+    index: Index,
+    eps: wp.float64,
+    active: IntArray,
+    # outputs
+    memory: Memory,
+):
+    """Elastic slips of the contacts at the end x of the step, by return mapping; zero of a pair that had no friction in it."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    if i == 0:
+        memory.count[env] = wp.min(contacts.count[env], contacts.force.shape[1])
+    if i < wp.min(contacts.count[env], contacts.force.shape[1]):
+        verts, pair = contacts.verts[env, i], contacts.pair[env, i]
+        entry, z = find_pair(index, lagged.verts, lagged.pair, env, verts, pair), wp.vec3d()
+        if entry >= 0:
+            c, n = lagged.coef[env, entry], lagged.normal[env, entry]
+            turn, now = turning.turn[env, turning.body[pair]], contacts.normal[env, i]
+            swing = contacts.gap[env, i] * (now - wp.transpose(turn) * now) - lagged.swing[env, entry]
+            w = lagged.slip[env, entry] + sliding(x, turning.x, env, verts, c, n) - (swing - wp.dot(swing, n) * n)
+            y = wp.length(w)
+            if y > eps:
+                w = (eps / y) * w
+            z = in_tangent_plane(turn * (wp.transpose(lagged.turn[env, entry]) * w), now)
+        memory.verts[env, i] = verts
+        memory.pair[env, i] = pair
+        memory.slip[env, i] = z
 
 
 @wp.kernel
@@ -120,7 +379,7 @@ def friction_rows(
         if limit <= wp.float64(0.0):
             continue
         verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
-        u = sliding(x, start, env, verts, c, n)
+        u = lagged.slip[env, i] + sliding(x, start, env, verts, c, n)
         y = wp.length(u)
         ratio = friction_slope_ratio(y, eps)
         for k in range(4):
@@ -159,14 +418,14 @@ def friction_change(
         return
     for i in range(lane, wp.min(lagged.count[env], lagged.limit.shape[1]), lanes):
         verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
-        y0 = wp.length(sliding(x0, start, env, verts, c, n))
-        y1 = wp.length(sliding(x1, start, env, verts, c, n))
+        y0 = wp.length(lagged.slip[env, i] + sliding(x0, start, env, verts, c, n))
+        y1 = wp.length(lagged.slip[env, i] + sliding(x1, start, env, verts, c, n))
         wp.atomic_add(change, env, lagged.limit[env, i] * (friction_potential(y1, eps) - friction_potential(y0, eps)))
 
 
 @wp.kernel
-def lag_difference(lagged: Lagged, sign: wp.float64, active: IntArray, lanes: wp.int32, force: VecArray2d, size: FloatArray):
-    """Adds sign · μ λ c_i n of every lagged pair to its vertices [N], and μ λ to ``size`` [N].
+def lag_difference(lagged: Lagged, sign: wp.float64, active: IntArray, lanes: wp.int32, force: VecArray2d, size: FloatArray2d):
+    """Adds sign · μ λ c_i n of every lagged pair to its vertices [N], and μ λ to ``size`` [N] of its sign.
 
     Called with + for the new and − for the old pairs, it leaves what changed of the normal forces *and* of where they act.
     """
@@ -178,18 +437,18 @@ def lag_difference(lagged: Lagged, sign: wp.float64, active: IntArray, lanes: wp
         for k in range(4):
             if verts[k] >= 0:
                 wp.atomic_add(force, env, verts[k], (sign * lagged.limit[env, i] * c[k]) * n)
-        if sign > wp.float64(0.0):
-            wp.atomic_add(size, env, lagged.limit[env, i])
+        wp.atomic_add(size, env, wp.int32(sign > wp.float64(0.0)), lagged.limit[env, i])
 
 
 @wp.kernel
-def clear_change(active: IntArray, change: VecArray2d, force: FloatArray, changed: FloatArray):
+def clear_change(active: IntArray, change: VecArray2d, force: FloatArray2d, changed: FloatArray):
     env, v = wp.tid()
     if active[env] == 0:
         return
     change[env, v] = wp.vec3d()
     if v == 0:
-        force[env] = wp.float64(0.0)
+        force[env, 0] = wp.float64(0.0)
+        force[env, 1] = wp.float64(0.0)
         changed[env] = wp.float64(0.0)
 
 
@@ -201,8 +460,10 @@ def size_of_change(change: VecArray2d, active: IntArray, size: FloatArray2d):
 
 
 @wp.kernel
-def share_of_change(force: FloatArray, active: IntArray, changed: FloatArray):
-    """changed ← changed / Σ μ λ."""
+def share_of_change(force: FloatArray2d, active: IntArray, changed: FloatArray, sum_changed: FloatArray):
+    """changed ← changed / Σ μ λ, and sum_changed ← the relative change of Σ μ λ."""
     env = wp.tid()
     if active[env] != 0:
-        changed[env] = changed[env] / wp.max(force[env], wp.float64(1.0e-300))
+        total = wp.max(force[env, 1], wp.float64(1.0e-300))
+        changed[env] = changed[env] / total
+        sum_changed[env] = wp.abs(force[env, 1] - force[env, 0]) / total

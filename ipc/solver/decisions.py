@@ -72,20 +72,39 @@ def choose_lagging(d: Decisions, f: Flags):
 
 
 @wp.kernel
-def after_lag(tolerance: wp.float64, d: Decisions, f: Flags):
-    """Minimises (again) where friction is new or changed by more than the tolerance."""
+def after_lag(tolerance: wp.float64, max_relags: wp.int32, d: Decisions, f: Flags):
+    """Minimises (again) where friction is new or changed by more than the tolerance.
+
+    From half of all renewals on only the sum of the limits has to settle: how a light contact divides it among vertices may lie within
+    what Newton's tolerance leaves open.
+
+    Where the change is not half the one before, the next forces are the mean of the new and the last: normal forces that friction has
+    changed, and friction that they bound, would else chase each other.
+    """
     env = wp.tid()
+    d.averaging[env] = 0
     if d.lagging[env] == 0:
         return
     d.pending[env] = 0
-    if d.relags[env] < 0 or d.changed[env] > tolerance:
-        d.relags[env] = d.relags[env] + 1
-        d.active[env] = 1
+    if d.relags[env] >= 0:
+        if d.changed[env] <= tolerance or (2 * d.relags[env] >= max_relags and d.sum_changed[env] <= tolerance):
+            return
+    if d.relags[env] >= max_relags:
         d.converged[env] = 0
-        d.since_lag[env] = 0
-        d.poor[env] = 0
-        d.rested[env] = 0
-        d.ready[env] = 1
+        return
+    d.share[env] = wp.float64(1.0)
+    if d.relags[env] > 0 and wp.float64(2.0) * d.changed[env] > d.last_changed[env]:
+        d.share[env] = wp.float64(0.5)
+        d.averaging[env] = 1
+        f.average[0] = 1
+    d.last_changed[env] = d.changed[env]
+    d.relags[env] = d.relags[env] + 1
+    d.active[env] = 1
+    d.converged[env] = 0
+    d.since_lag[env] = 0
+    d.poor[env] = 0
+    d.rested[env] = 0
+    d.ready[env] = 1
 
 
 @wp.kernel
@@ -298,8 +317,10 @@ def conclude(tolerance: wp.float64, max_newton: wp.int32, max_relags: wp.int32, 
                 d.active[env] = 0
     if was_active != 0 and d.since_lag[env] >= max_newton:
         d.active[env] = 0
-    if was_active != 0 and d.active[env] == 0 and friction != 0 and d.relags[env] < max_relags:
-        d.pending[env] = 1
+    # Where Newton gave up, forces are no better known after another lag; the first two may still help it on.
+    if was_active != 0 and d.active[env] == 0 and friction != 0 and max_relags > 0:
+        if d.converged[env] != 0 or (d.relags[env] < 2 and d.relags[env] < max_relags):
+            d.pending[env] = 1
 
 
 @wp.kernel

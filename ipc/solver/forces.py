@@ -57,17 +57,17 @@ def _normal_forces(potential: Potential) -> _Forces:
 
 
 def _friction_forces(potential: Potential) -> _Forces:
-    """Friction forces −μ λ f1(|u|) u / |u| of the lagged contacts, u their sliding in the step."""
+    """Friction forces −μ λ f1(|w|) w / |w| of the lagged contacts, w their elastic slip."""
     lagged = potential.collision.lagged
     pair = host(lagged.pair)
     at = np.nonzero(np.arange(pair.shape[1]) < host(lagged.count)[:, None])
     verts, coef, normal = host(lagged.verts)[at], host(lagged.coef)[at], host(lagged.normal)[at]
     moved = host(potential.x) - host(potential.x_start)
     u = np.einsum("cn,cni->ci", np.where(verts >= 0, coef, 0.0), moved[at[0][:, None], np.maximum(verts, 0)])
-    u -= (u * normal).sum(axis=1, keepdims=True) * normal
-    y, eps = np.linalg.norm(u, axis=1), potential.friction_eps
+    w = host(lagged.slip)[at] + u - (u * normal).sum(axis=1, keepdims=True) * normal
+    y, eps = np.linalg.norm(w, axis=1), potential.settings.friction_slip
     ratio = np.where(y >= eps, 1.0 / np.maximum(y, eps), (2.0 - y / eps) / eps)
-    return _Forces(at[0], pair[at], verts, coef, -(host(lagged.limit)[at] * ratio)[:, None] * u)
+    return _Forces(at[0], pair[at], verts, coef, -(host(lagged.limit)[at] * ratio)[:, None] * w)
 
 
 def _all_forces(potential: Potential) -> list[_Forces]:

@@ -85,6 +85,10 @@ class Newton:
             self._graphs[key] = capture.graph
         wp.capture_launch(self._graphs[key])
 
+    def forget_recordings(self) -> None:
+        """Record anew at the next step: buffers have grown."""
+        self._graphs.clear()
+
     # --- the step --------------------------------------------------------------------------------------------------------------
 
     def step(self, alive: NDArray[np.bool_]) -> dict[str, NDArray]:
@@ -97,7 +101,7 @@ class Newton:
             if not self.potential.collision.overflow.numpy()[0]:
                 break
             self.potential.collision.grow()
-            self._graphs.clear()
+            self.forget_recordings()
             self._run(self._rest)
             values = self.state.read()
         else:
@@ -178,8 +182,10 @@ class Newton:
         with self._stage("lag"):
             pot.touch(state.decisions.pending)
             state.launch(decisions.choose_lagging)
-            pot.collision.lag(state.decisions.lagging, state.decisions.changed)
-            state.launch(decisions.after_lag, self.settings.friction_tolerance)
+            d = state.decisions
+            pot.collision.lag(d.relags, d.lagging, d.changed, d.sum_changed)
+            state.launch(decisions.after_lag, self.settings.friction_tolerance, self.settings.friction_relags)
+            wp.capture_if(state.flags.average, pot.collision.average, share=d.share, active=d.averaging)
 
     def _solve(self) -> None:
         """p for the active environments; with a definite matrix where negative curvature was met."""
@@ -282,6 +288,8 @@ class Newton:
             pot.launch(dynamics.new_velocity, pot.xw.shape, [pot.xw1, pot.xw, pot.dt, d.good], [pot.v])
             pot.set_frames(d.progress, pot.R, pot.t)
             pot.place_vertices(pot.y, pot.R, pot.t, pot.x)
+            if self._friction:
+                pot.collision.remember(pot.x, pot.y, pot.R, self.settings.friction_slip, d.good)
             wp.copy(pot.frame_q, pot.now_q)
             wp.copy(pot.frame_p, pot.t)
             pot.energies()

@@ -102,6 +102,7 @@ class Potential:
         self.dilation = numbers(batch, blocks)
         self.node_change, self.force_size, self.vert_size = numbers(batch, nodes), numbers(batch, nodes), numbers(batch, verts)
         self.reach, self.barrier, self.elastic_energy, self.kinetic = (numbers() for _ in range(4))
+        self.collision.measure_from(self.x_start, self.y_start, self.frame_q, self.goal_q)
         self.project = wp.zeros(batch, dtype=wp.int32, device=device)
         self.everyone = wp.full(batch, 1, dtype=wp.int32, device=device)
 
@@ -133,8 +134,8 @@ class Potential:
 
     @property
     def friction_eps(self) -> float:
-        """ε = ε_v h [m]."""
-        return self.settings.friction_velocity * self.dt
+        """ε [m]."""
+        return self.settings.friction_slip
 
     def set_dt(self, dt: float) -> None:
         """Let the next steps be ``dt`` [s] long."""

@@ -58,6 +58,10 @@ class Decisions:
     slack: FloatArray  # share of a gap that has to stay
     floor: FloatArray  # gap that has to stay
     changed: FloatArray  # share of the friction forces that the last lag changed
+    last_changed: FloatArray  # and the one before
+    sum_changed: FloatArray  # by how much the last lag changed the sum of the limits, as a share of it
+    share: FloatArray  # of the last lag in the friction forces, the rest being those before it
+    averaging: IntArray  # that share is not 1
     speed: FloatArray
     ccd: FloatArray
     min_gap: FloatArray
@@ -71,6 +75,7 @@ class Flags:
     halt: IntArray
     go: IntArray
     pending: IntArray
+    average: IntArray
     advance: IntArray
     again: IntArray
     shorten: IntArray

@@ -75,8 +75,8 @@ def test_forces_balance_to_the_residual(friction: float) -> None:
     mesh = small_pad()
     ball = ipc.KinematicBody("ball", ipc.icosphere(4e-3, 2), ipc.Pose((0.0, 0.0, 4.12e-3)))
     for tolerance, relative in ((1e-5, 1e-4), (1e-9, 1e-8)):
-        settings = ipc.Settings(d_hat=1e-4, friction=friction, velocity_tolerance=tolerance, linear_tolerance=1e-4)
-        world = ipc.World([bonded_pad(mesh), ball], settings, device="cpu")
+        options: dict = {"velocity_tolerance": tolerance, "linear_tolerance": 1e-4, "friction_tolerance": 0.1 * relative}
+        world = ipc.World([bonded_pad(mesh), ball], ipc.Settings(d_hat=1e-4, friction=friction, **options), device="cpu")
         corners = mesh.vertices[mesh.tets]
         quarter = 1000 * np.linalg.det(corners[:, 1:] - corners[:, :1]) / 24
         mass = np.bincount(mesh.tets.ravel(), weights=np.repeat(quarter, 4))[:, None]
@@ -84,7 +84,7 @@ def test_forces_balance_to_the_residual(friction: float) -> None:
             before = world.velocities("pad")[0]
             world.set_target("ball", (3e-5 * k, 0.0, 4.12e-3 - 1e-4 * (k + 1)))
             assert world.step().converged[0]
-        inertia = mass * (world.velocities("pad")[0] - before) / settings.dt
+        inertia = mass * (world.velocities("pad")[0] - before) / world.settings.dt
         on_ball, on_case = world.wrench("ball"), world.wrench("pad")
         size, remainder = np.linalg.norm(on_ball.force[0]), on_ball.force[0] + on_case.force[0] + inertia.sum(axis=0)
         assert size > 0.1 and np.abs(inertia).sum() > 1e-5 * size

@@ -65,15 +65,22 @@ def test_a_lowered_force_keeps_coulombs_law(kind):
     """Sheared until it slides, then let up: the force asked for, friction within its cone and less as the force goes, no pull."""
     sensor = replace(SENSOR, gelpad=replace(SENSOR.gelpad, friction=0.3))
     pad = uncorrected(press(indent(force=1.5), StageSpec("shear", shear=(0.0, 0.5e-3)), indent(force=0.3), kind=kind), sensor)
-    states = list(pad.run(3))[1:]
-    sheared, lowered = states[3:6], states[6:]
+    states, shares = [], []
+    for state in pad.run(3):
+        states.append(state)
+        assert pad.solver is not None
+        pairs = pad.solver.world.pressing().values()
+        friction = sum((np.linalg.norm(forces.wrench[0, :3] - forces.normal[0]) for forces in pairs), 0.0)
+        shares.append(friction / max(pad.solver.world.contacts().force.sum(), 1e-9))
+    sheared, lowered = states[4:7], states[7:]
+    assert max(shares) < 1.01 * 0.3 and min(shares[6:]) > 0.27
     assert sheared[-1].shear_force[0, 1] > 0.25 * sheared[-1].normal_force[0]
     for state, force in zip(lowered, (1.1, 0.7, 0.3), strict=True):
         assert not state.failed[0] and state.normal_force[0] == pytest.approx(force, rel=1e-3)
         assert state.shear_force[0, 1] > 0.0
         assert state.solved.forces[..., 2].max() <= 1e-3 * force
-    for state in (*sheared, *lowered):
-        assert np.linalg.norm(state.shear_force[0]) <= 1.02 * 0.3 * state.normal_force[0]
+    for state in (*sheared, *lowered):  # facets of a millimetre plough besides
+        assert np.linalg.norm(state.shear_force[0]) <= 1.1 * 0.3 * state.normal_force[0]
     dragged = [state.shear_force[0, 1] for state in (sheared[-1], *lowered)]
     depths = [state.depth[0] for state in (sheared[-1], *lowered)]
     assert (np.diff(dragged) < 0.0).all() and (np.diff(depths) < 0.0).all()
@@ -115,6 +122,17 @@ def test_friction_is_coulombs():
     pad = uncorrected(press(indent(0.5e-3), StageSpec("shear", shear=(0.2e-3, 0.0))), FRICTIONLESS)
     state = pad.peak(pad.run())
     assert abs(state.shear_force[0, 0]) < 0.05 * state.normal_force[0]  # facets of a millimetre plough
+
+
+def test_a_hold_keeps_the_shear():
+    """While nothing moves the contact forgets nothing, though each state came in a few steps of the solver."""
+    pad = uncorrected(press(indent(0.8e-3), StageSpec("shear", shear=(0.2e-3, 0.0))))
+    state = pad.peak(pad.run())
+    assert pad.solver is not None and state.shear_force[0, 0] > 0.1 * state.normal_force[0]
+    poses = pad.solver.scene.pose("object")
+    for _ in range(20):
+        assert not pad.solver.step(poses).any()
+    assert pad.solver.forces()[0, :, 0].sum() == pytest.approx(state.shear_force[0, 0], rel=0.01)
 
 
 def test_twist_turns_with_the_object():

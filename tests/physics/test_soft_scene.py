@@ -119,10 +119,10 @@ def test_the_share_of_a_motion_is_bounded_by_distance_and_step():
 
 def test_a_scene_takes_its_accuracy_and_its_substeps_from_its_settings():
     cube = scene_body("cube", (primitive("box", (HALF,) * 3),), "kinematic", friction=0.0)
-    accuracy = SceneSettings(creep=1e-4, tolerance=1e-7, linear_tolerance=1e-5, substeps=SubstepLimits(step=1e-3, most=16))
+    accuracy = SceneSettings(slip=1e-6, tolerance=1e-7, linear_tolerance=1e-5, substeps=SubstepLimits(step=1e-3, most=16))
     scene = SoftScene([ScenePad("left", SENSOR, MESH)], [cube], fingers(0.3e-3)[:1], {"cube": np.eye(4)}, accuracy=accuracy)
     solver = scene.settings
-    assert (solver.friction_velocity, solver.linear_tolerance) == (1e-4, 1e-5)
+    assert (solver.friction_slip, solver.linear_tolerance) == (1e-6, 1e-5)
     assert solver.velocity_tolerance * solver.dt == pytest.approx(1e-7)
     usual = SoftScene([ScenePad("left", SENSOR, MESH)], [cube], fingers(0.3e-3)[:1], {"cube": np.eye(4)})
     goal = fingers(-0.2e-3)[:1]

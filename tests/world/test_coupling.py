@@ -143,7 +143,7 @@ def test_a_light_finger_presses_a_flat_face_with_its_force():
             bond = rig.scene.bond_wrench("finger")[0]
             assert bond[2] == pytest.approx(rig.wrench[0, 2], rel=0.01)  # what the link feels is what the pad does to it
     assert forces[True][-1] == pytest.approx(2.0, rel=0.02)
-    assert np.ptp(forces[False][2:]) > 2.0
+    assert np.abs(np.array(forces[False][2:]) - 2.0).max() > 1.5
 
 
 @pytest.mark.solver

@@ -62,15 +62,14 @@ class PressController:
             else:
                 shear, twist = self._shear, twist + fraction * (self._targets.twist(stage) - twist)
             self._move(self._depth, shear, twist, follow=True)
-            self._settle()  # a shear unloads what lies behind the object
+            if not np.isfinite(self._force).any():
+                self._settle_depth()  # a shear unloads what lies behind the object
         elif stage.kind == "release":
             self._force[:] = np.nan
             self._release(depth, fraction)
         elif stage.force is not None:
             self._force[:] = self._start_force + fraction * (stage.force - self._start_force)
             self._load()
-            if not self._is_free and (self._force < self._start_force).any():
-                self._settle()
         else:
             self._force[:] = np.nan
             depth = np.maximum(depth, 0.0)
@@ -105,8 +104,6 @@ class PressController:
             self._depth = depth
             self._step()
             self._settle_depth()
-        if (travel < 0.0).any():
-            self._settle_friction()
 
     def _move(
         self, depth: np.ndarray, shear: np.ndarray, twist: np.ndarray, stretch: float = 1.0, *, follow: bool = False
@@ -150,22 +147,6 @@ class PressController:
                 self._settle_depth()
         self.failed |= ~self._solver.converged
 
-    def _settle_friction(self) -> None:
-        self.failed |= self._solver.settle_friction(self.poses(), self.case(), self.failed)
-
-    def _settle(self) -> None:
-        """Let friction agree with the present contacts, at the prescribed force or depth."""
-        if not np.isfinite(self._force).any():
-            self._settle_depth()
-            self._settle_friction()
-            self._settle_depth()
-            return
-        for _ in range(self._control.refinements):  # where friction yields the force changes too, and restoring it costs steps
-            if (self._solver.obeys_friction() | self.failed).all():
-                return
-            self._settle_friction()
-            self._load()
-
     def _clearance_error(self) -> np.ndarray:
         """Measured less applied clearance [m], (B,); 0 out of contact or at a prescribed force."""
         clearance = self._reader.clearance(self._solver.coat_state(self.poses()))
@@ -188,7 +169,6 @@ class PressController:
                 self._depth = lift - CLEARANCE
             return
         self._move(depth + fraction * (lift - CLEARANCE - depth), self._shear, self._twist, self._control.release_stretch)
-        self._settle_friction()
 
     def _load(self) -> None:
         """Reach the normal force: a free object by its weight, a driven one by a secant search."""

@@ -31,8 +31,8 @@ class PressSolver:
             dt=control.time_step,
             d_hat=mesh.d_hat,
             velocity_tolerance=control.tolerance / control.time_step,
-            friction_velocity=control.creep / control.time_step,
-            friction_relags=0,  # a loading in small steps stays within the cone; settle_friction follows an unloading
+            friction_slip=control.slip,
+            friction_tolerance=control.friction_tolerance,
         )
         identity = np.tile(np.eye(4), (len(start), 1, 1))
         pads = [ScenePad(PAD, sensor, mesh)]
@@ -89,34 +89,6 @@ class PressSolver:
         self.converged = report.last_converged
         self.unconverged = self.unconverged + report.unconverged
         return report
-
-    def settle_friction(self, pad_from_object: np.ndarray, world_from_pad: np.ndarray | None, failed: np.ndarray) -> np.ndarray:
-        """Repeat steps at rest until friction agrees with the normal forces; poses as for ``step``.
-
-        Friction is bounded by the normal forces at the beginning of a step. In an unloading these are too large, and some belong to
-        contacts that the step has opened: friction would pull on the pad where nothing touches it any more. Environments that
-        ``failed``, (B,), are not waited for. Returns the mask (B,) of those that have failed by the end.
-        """
-        failed, forces = failed.copy(), self.forces()
-        for _ in range(self.control.friction_steps):
-            if not forces[~failed].any():
-                break
-            self.fail(failed)
-            failed |= self.step(pad_from_object, world_from_pad)
-            last, forces = forces, self.forces()
-            change, total = (np.linalg.norm(f, axis=2).sum(axis=1) for f in (forces - last, forces))
-            if (((change <= self.control.friction_tolerance * total) & self.obeys_friction()) | failed).all():
-                break
-        return failed
-
-    def obeys_friction(self) -> np.ndarray:
-        """Mask (B,): total force in Coulomb's cone and no tension, within ``friction_tolerance``."""
-        forces, tolerance, least = self.forces(), self.control.friction_tolerance, self.control.friction_force
-        total = forces.sum(axis=1)
-        normal = np.maximum(-total[:, 2], 0.0)
-        limit = (1.0 + tolerance) * self._friction * normal + least
-        tension = np.maximum(forces[:, :, 2], 0.0).sum(axis=1)
-        return (np.linalg.norm(total[:, :2], axis=1) <= limit) & (tension <= tolerance * normal + least)
 
     def set_gravity(self, share: float) -> None:
         """Let gravity act with a ``share`` of its strength, towards −z of the world."""

@@ -94,8 +94,7 @@ class SoftScene:
             dt=dt,
             d_hat=d_hat,
             velocity_tolerance=accuracy.tolerance / dt,
-            friction_velocity=accuracy.creep,
-            friction_relags=0,  # every step renews it, and steps are small in contact
+            friction_slip=accuracy.slip,
             linear_tolerance=accuracy.linear_tolerance,
         )
         solids = [self._at_start(body.solid, self._start[1][body.name][0]) for body in bodies]

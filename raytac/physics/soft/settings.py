@@ -111,12 +111,12 @@ class SubstepLimits(_Settings):
 class SceneSettings(_Settings):
     """Accuracy of a soft scene, whose steps have a physical duration."""
 
-    creep: float = 5e-5
-    """ε_v [m/s]: at a share r of the friction limit a contact creeps at ε_v (1 − √(1 − r))."""
+    slip: float = 5e-7
+    """Elastic slip ε of a contact [m]: under a share r of the friction limit it gives way by ε (1 − √(1 − r)), and keeps it."""
     tolerance: float = 2e-8
-    """A step is solved when no vertex would move further [m]; small against ε_v dt."""
+    """A step is solved when no vertex would move further [m]; small against ``slip``."""
     linear_tolerance: float = 1e-6
-    """Relative residual of the linear solve: a grasped body must follow far below ε_v dt."""
+    """Relative residual of the linear solve: a grasped body must follow far below ``slip``."""
     substeps: SubstepLimits = SubstepLimits()
     """Division of steps near contact."""
 
@@ -129,8 +129,8 @@ class PressControl(_Settings):
     """Duration of a solver step [s]; without influence where inertia is negligible."""
     tolerance: float = 5e-7
     """A step is solved when no vertex would move further [m]."""
-    creep: float = 1e-6
-    """Creep of a sticking contact in one step [m]."""
+    slip: float = 1e-6
+    """Elastic slip of a contact that sticks [m]."""
     blocked: float = 1e-3
     """Share of a step's motion that may be refused before a contact counts as jammed."""
     stiffer: float = 4.0
@@ -139,12 +139,8 @@ class PressControl(_Settings):
     A barrier's pressure is bounded while surfaces keep apart, and few small facets carry the force."""
     stiffenings: int = 4
     """Most such increases in one step."""
-    friction_tolerance: float = 0.01
-    """Share by which settled forces change in a step at most, and may leave the friction cone."""
-    friction_steps: int = 60
-    """Most steps at rest that settle friction."""
-    friction_force: float = 1e-5
-    """Force too small for Coulomb's law to be judged [N]."""
+    friction_tolerance: float = 1e-3
+    """Share by which the normal forces that bound friction may be off in a solved step; a search for a force needs it to be small."""
     depth_tolerance: float = 1e-6
     """A depth is reached within this [m]."""
     force_tolerance: float = 5e-4

@@ -29,7 +29,7 @@ class Scene:
         v[:, 2] += 1.0 + gap - v[:, 2].min()
         bodies = [ipc.SoftBody("a", a, ipc.Material(1e5)), ipc.SoftBody("b", ipc.TetMesh(v, b.tets), ipc.Material(1e5))]
         self.layout = build_layout(bodies, friction, {}, [])
-        settings = ipc.Settings(dt=1.0, friction_velocity=EPS)
+        settings = ipc.Settings(dt=1.0, friction_slip=EPS)
         self.solver = Potential(self.layout, settings, 1, D_HAT, KAPPA, wp.get_device("cpu"))
         self.solver.y.assign(self.layout.node_rest[None])
         self.solver.frame_q.fill_(wp.quatd(0.0, 0.0, 0.0, 1.0))
@@ -181,7 +181,7 @@ def test_gradient_matches_finite_differences_near_parallel_edges(rng: np.random.
 def test_friction_matches_ipctk(slide: float, rng: np.random.Generator) -> None:
     scene = Scene(0.02, TILTS["corner"], friction=MU)
     scene.evaluate(scene.x)
-    scene.solver.collision.lag(scene.solver.everyone, scene.solver.reach)
+    scene.solver.collision.lag(scene.solver.everyone, scene.solver.everyone, scene.solver.reach, scene.solver.kinetic)
     _, normal = scene.evaluate(scene.x)
     moved = scene.x.copy()
     moved[scene.x[:, 2] > 1.001] += slide * np.array([0.6, 0.8, 0.1])
@@ -204,10 +204,18 @@ def barrier_gradient(x: np.ndarray) -> np.ndarray:
     return bare.evaluate(x)[1]
 
 
-def test_friction_hessian_matches_finite_differences(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("size", [0.0, 0.7], ids=["from rest", "with slip"])
+def test_friction_force_and_hessian_match_finite_differences(size: float, rng: np.random.Generator) -> None:
+    """Of the energy and of the force, also with elastic slips that the pairs brought along, below and beyond ε."""
     scene = Scene(0.02, TILTS["corner"], friction=MU)
     scene.evaluate(scene.x)
-    scene.solver.collision.lag(scene.solver.everyone, scene.solver.reach)
+    collision = scene.solver.collision
+    collision.lag(scene.solver.everyone, scene.solver.everyone, scene.solver.reach, scene.solver.kinetic)
+    n = collision.lagged.normal.numpy()
+    z = rng.standard_normal(n.shape)
+    z -= (z * n).sum(axis=-1, keepdims=True) * n
+    z *= size * EPS / np.maximum(np.linalg.norm(z, axis=-1, keepdims=True), 1e-300)
+    collision.lagged.slip.assign(z)
     far = scene.x.copy()
     far[scene.x[:, 2] > 1.001] += [0.4 * EPS, 0.1 * EPS, 0.0]
     bare = Scene(0.02, TILTS["corner"])
@@ -215,13 +223,27 @@ def test_friction_hessian_matches_finite_differences(rng: np.random.Generator) -
     def friction_gradient(x: np.ndarray) -> np.ndarray:
         return scene.evaluate(x, start=scene.x)[1] - bare.evaluate(x)[1]
 
-    scene.evaluate(far, start=scene.x)
+    def energy_change(x: np.ndarray) -> float:
+        changes = []
+        for one in (scene, bare):
+            one.evaluate(x, start=scene.x)
+            s, change = one.solver, wp.zeros(1, dtype=wp.float64, device="cpu")
+            s.x.assign(far[None])
+            s.x1.assign(x[None])
+            s.collision.energy_change(s.x, s.x1, s.x_start, s.R, s.t, s.kappa, EPS, s.everyone, change)
+            changes.append(float(change.numpy()[0]))
+        return changes[0] - changes[1]
+
+    force = friction_gradient(far)
     H = scene.hessian()
     bare.evaluate(far)
     H = H - bare.hessian()
     for _ in range(3):
         u = rng.standard_normal(far.shape)
         h = 1e-3 * EPS
+        slope = (energy_change(far + h * u) - energy_change(far - h * u)) / (2 * h)
+        assert abs((force * u).sum()) > 1e-6
+        assert slope == pytest.approx((force * u).sum(), rel=1e-4)
         expected = (friction_gradient(far + h * u) - friction_gradient(far - h * u)).ravel() / (2 * h)
         got = H @ u.ravel()
         assert np.abs(expected).max() > 1e-3

@@ -345,9 +345,7 @@ def random_presses(setup: Setup, count: int, seed: int = 0) -> Worst:
         low = (rotation_matrix(turn) @ shape.vertices.T)[:, 2].min(axis=1)
         start = np.column_stack([rng.uniform(-3e-3, 3e-3, (envs, 2)), 0.15e-3 - low])
         tool = ipc.KinematicBody("tool", shape, ipc.Pose((0.0, 0.0, 0.02)))
-        settings = ipc.Settings(
-            dt=0.02, d_hat=1e-4, friction=0.5, max_newton=MAX_NEWTON, friction_relags=1, velocity_tolerance=1e-3
-        )
+        settings = ipc.Settings(dt=0.02, d_hat=1e-4, friction=0.5, max_newton=MAX_NEWTON, velocity_tolerance=1e-3)
         world = ipc.World([pad, tool], settings, num_envs=envs, device=setup.device)
         world.teleport("tool", start, turn)
         depth, side, twist = rng.uniform(0.2e-3, 1.5e-3, envs), rng.uniform(-1e-3, 1e-3, (envs, 2)), rng.uniform(-0.5, 0.5, envs)
