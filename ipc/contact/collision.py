@@ -306,7 +306,10 @@ class Collision:
     # --- friction --------------------------------------------------------------------------------------------------------------
 
     def measure_from(self, x: wp.array, y: wp.array, frame_q: wp.array, goal_q: wp.array) -> None:
-        """Say where vertices (B, V), nodes (B, N), frames (B, frames) of the start of a step are kept, and the frames' goals."""
+        """Say where the start of a step is kept, and the frames' goals.
+
+        Vertices are (B, V), nodes (B, N), frames (B, frames).
+        """
         self._turning.x, self._turning.y, self._turning.frame_q, self._turning.goal_q = x, y, frame_q, goal_q
 
     def lag(self, relags: wp.array, active: wp.array, changed: wp.array, sum_changed: wp.array) -> None:
@@ -331,7 +334,10 @@ class Collision:
         self._launch(friction.share_of_change, self.batch, [self._force, active], [changed, sum_changed])
 
     def average(self, share: wp.array, active: wp.array) -> None:
-        """Let only a ``share`` (B,) of the limits be those of the last ``lag``, and the rest those before it."""
+        """Let a ``share`` (B,) of the limits be those of the last ``lag``.
+
+        The rest are those before it.
+        """
         self._launch(friction.weigh_fresh, self.lagged.limit.shape, [share, active], [self.lagged])
         self._fill_index(self.lagged, active)
         self._each(friction.add_old, [self._old, share, self._index, active], [self.lagged])
@@ -361,7 +367,10 @@ class Collision:
             counts.assign(count)
 
     def slips(self) -> tuple[np.ndarray, np.ndarray]:
-        """What :meth:`remember` keeps: vertices and body pair, −1 unused (B, C, 5), and elastic slip [m] (B, C, 3)."""
+        """Vertices and body pair that :meth:`remember` keeps, and their elastic slip [m].
+
+        Shapes (B, C, 5), −1 where unused, and (B, C, 3).
+        """
         memory = self.memory
         count = memory.count.numpy()
         used = np.arange(count.max(initial=0)) < count[:, None]
@@ -370,7 +379,10 @@ class Collision:
         return np.where(used[..., None], keys, -1), np.where(used[..., None], slip, 0.0)
 
     def set_slips(self, pairs: np.ndarray, slip: np.ndarray, envs: np.ndarray) -> bool:
-        """Set, in the environments of the mask (B,), what :meth:`slips` returns; True if buffers had to grow for it."""
+        """Set what :meth:`slips` returns, in the environments of the mask (B,).
+
+        Returns True if buffers had to grow for it.
+        """
         used = pairs[..., 0] >= 0
         counts = used.sum(axis=1)
         most = int(counts[envs].max(initial=0))

@@ -39,7 +39,9 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Lagged:
-    """The pairs whose normal force is held fixed: ``fresh`` ones, from the contacts, and such as an average with older ones kept.
+    """The pairs whose normal force is held fixed.
+
+    ``fresh`` ones are from the contacts, the others such as an average with older ones kept.
 
     ``limit`` is μ λ [N], ``slip`` the part of w that the step does not change [m], ``turn`` Q over the step as it was known at the lag,
     and ``swing`` what the gap turned by it [m].
@@ -69,7 +71,10 @@ class Memory:
 
 @wp.struct
 class Index:
-    """A hash of pairs by their vertices: the first entry of each slot and the next of each entry, −1 for none."""
+    """A hash of pairs by their vertices.
+
+    The first entry of each slot and the next of each entry, −1 for none.
+    """
 
     first: IntArray2d
     next: IntArray2d
@@ -77,7 +82,7 @@ class Index:
 
 @wp.struct
 class Turning:
-    """How far bodies have turned since the start of the step.
+    """Turns of bodies since the start of the step.
 
     Attributes:
         x, y: vertices (B, V) and nodes (B, N) at the start [m].    frame_q, goal_q: frames at the start and at the end (B, frames).
@@ -131,7 +136,10 @@ def sliding(x: VecArray2d, start: VecArray2d, env: wp.int32, verts: wp.vec4i, c:
 
 @wp.func
 def rotation_in(A: wp.mat33d) -> wp.mat33d:
-    """The rotation nearest to A, from the identity on (Müller et al. 2016, "A Robust Method to Extract the Rotational Part")."""
+    """The rotation nearest to A, from the identity on.
+
+    Müller et al. 2016, "A Robust Method to Extract the Rotational Part of Deformations".
+    """
     R = wp.identity(n=3, dtype=wp.float64)
     for _ in range(30):
         turn, size = wp.vec3d(), wp.float64(0.0)
@@ -160,7 +168,10 @@ def turns_ahead(turning: Turning, active: IntArray, turn: MatArray2d):
 
 @wp.kernel
 def turns(turning: Turning, y: VecArray2d, R: MatArray2d, active: IntArray, turn: MatArray2d):
-    """Q of every body from the start of the step to y and R; of up to 256 nodes where no frame carries it."""
+    """Q of every body from the start of the step to y and R.
+
+    It is that of up to 256 nodes where no frame carries the body.
+    """
     env, body = wp.tid()
     if active[env] == 0:
         return
@@ -203,16 +214,19 @@ def slot_of(verts: wp.vec4i, slots: wp.int32) -> wp.int32:
 def find_pair(
     index: Index, verts: wp.array2d(dtype=wp.vec4i), pairs: IntArray2d, env: wp.int32, v: wp.vec4i, pair: wp.int32
 ) -> wp.int32:
-    """Entry of a pair, −1 without one. Two edges of a body may have the vertices of a point and a triangle; the lowest entry counts."""
-    found = wp.int32(-1)
+    """Entry of a pair, −1 without one.
+
+    Two edges of a body may have the vertices of a point and a triangle; the lowest entry counts.
+    """
+    entry = wp.int32(-1)
     k = index.first[env, slot_of(v, index.first.shape[1])]
     while k >= 0:
         u = verts[env, k]
         if u[0] == v[0] and u[1] == v[1] and u[2] == v[2] and u[3] == v[3] and pairs[env, k] == pair:
-            if found < 0 or k < found:
-                found = k
+            if entry < 0 or k < entry:
+                entry = k
         k = index.next[env, k]
-    return found
+    return entry
 
 
 @wp.kernel
@@ -266,7 +280,9 @@ def weigh_fresh(share: FloatArray, active: IntArray, out: Lagged):
 
 @wp.kernel
 def add_old(old: Lagged, share: FloatArray, index: Index, active: IntArray, lanes: wp.int32, out: Lagged):
-    """Adds what the average has of the last lag's fresh pairs: to the same pair, or as one of its own where that has gone.
+    """Adds what the average has of the last lag's fresh pairs.
+
+    It goes to the same pair, or is one of its own where that has gone.
 
     So no pair is kept beyond two lags, and there are never more than twice as many as contacts.
     """
@@ -296,7 +312,10 @@ def lag_contacts(
     # outputs
     out: Lagged,
 ):
-    """Freezes the contacts of the active environments, with what they remember; ``relags`` is −1 at the start of the step."""
+    """Freezes the contacts of the active environments, with what they remember.
+
+    ``relags`` is −1 at the start of the step.
+    """
     env, i = wp.tid()
     if active[env] == 0:
         return
@@ -335,7 +354,10 @@ def remember(
     # outputs
     memory: Memory,
 ):
-    """Elastic slips of the contacts at the end x of the step, by return mapping; zero of a pair that had no friction in it."""
+    """Elastic slips of the contacts at the end x of the step, by return mapping.
+
+    They are zero of a pair that had no friction in it.
+    """
     env, i = wp.tid()
     if active[env] == 0:
         return
@@ -425,7 +447,9 @@ def friction_change(
 
 @wp.kernel
 def lag_difference(lagged: Lagged, sign: wp.float64, active: IntArray, lanes: wp.int32, force: VecArray2d, size: FloatArray2d):
-    """Adds sign · μ λ c_i n of every lagged pair to its vertices [N], and μ λ to ``size`` [N] of its sign.
+    """Adds sign · μ λ c_i n of every lagged pair to its vertices [N].
+
+    μ λ is added to ``size`` [N] of its sign.
 
     Called with + for the new and − for the old pairs, it leaves what changed of the normal forces *and* of where they act.
     """

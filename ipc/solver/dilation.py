@@ -1,4 +1,4 @@
-"""Volume blocks: groups of tetrahedra whose volumetric energy depends on their mean dilation.
+"""Volume blocks: tetrahedra whose volumetric energy depends on their mean dilation.
 
 A linear tetrahedron has one volume condition and, in a large mesh, half a node or less to meet it with; so nearly incompressible bodies
 lock. A block b of tetrahedra e with volumes V_e has one condition for all of them: with
@@ -108,7 +108,10 @@ def block_energy_change(
     # outputs
     change: FloatArray2d,
 ):
-    """Adds V_b (λ − λ')/2 (J̄ − a)² at y1, less that at y0 [J], to the first element of each block."""
+    """Adds V_b (λ − λ')/2 (J̄ − a)² at y1, less that at y0 [J].
+
+    Each block's goes to its first element.
+    """
     env, b = wp.tid()
     if active[env] == 0:
         return

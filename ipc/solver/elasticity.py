@@ -334,7 +334,9 @@ def element_energy_change(
     det: FloatArray2d,
     det_change: FloatArray2d,
 ):
-    """Ψ(y1) − Ψ(y0) of every element [J], J at y1, and its change; sums of differences keep digits.
+    """Ψ(y1) − Ψ(y0) of every element [J], J at y1, and its change.
+
+    Sums of differences keep digits.
 
     What belongs to a volume block is left to the block.
     """

@@ -1,4 +1,6 @@
-"""The Newton matrix H = blocks + Σ q qᵀ: a block matrix of one pattern, rows of volume blocks and of contacts.
+"""The Newton matrix H = blocks + Σ q qᵀ.
+
+It is a block matrix of one pattern, with rows of volume blocks and of contacts.
 
 Products with it, its diagonal, and approximations of its inverse. Everything here can be recorded in a CUDA graph: launches have fixed
 dimensions, counts are read on the device.
@@ -103,7 +105,10 @@ def block_row(system: SystemView, env: wp.int32, i: wp.int32, p: VecArray2d) -> 
 def multiply_blocks(
     system: SystemView, p: VecArray2d, active: IntArray, threads: wp.int32, out: VecArray2d, partial: FloatArray2d
 ):
-    """out = (blocks + volume rows) p on the unknowns, else 0, and shares of p·out; (B, chunks, n)."""
+    """out = (blocks + volume rows) p on the unknowns, else 0, and shares of p·out.
+
+    Shares are (B, chunks, n).
+    """
     env, c, lane = wp.tid()
     total = wp.float64(0.0)
     if active[env] != 0:
@@ -201,7 +206,10 @@ def push_rows(system: SystemView, contacts: Contacts, dx: VecArray2d, active: In
 
 @wp.kernel
 def push_blocks(system: SystemView, lift: VecArray2d, active: IntArray, residual: VecArray2d):
-    """residual −= (blocks + volume rows) · lift on the unknowns: prescribed motion of gripped nodes."""
+    """residual −= (blocks + volume rows) · lift on the unknowns.
+
+    The lift is the prescribed motion of gripped nodes.
+    """
     env, i = wp.tid()
     if active[env] != 0 and system.free[i] != 0:
         residual[env, i] = residual[env, i] - block_row(system, env, i, lift)

@@ -70,7 +70,10 @@ def span(used: ArrayLike, margin: int = 0) -> slice:
 
 
 def boxes(masks: np.ndarray) -> np.ndarray:
-    """Columns [c0, c1) and rows [r0, r1) of the True values of masks (B, Ny, Nx), (B, 4), uint32; 0 for none."""
+    """Columns [c0, c1) and rows [r0, r1) of the True values of masks (B, Ny, Nx).
+
+    (B, 4), uint32; 0 for none.
+    """
     lines = np.any(masks, axis=1), np.any(masks, axis=2)
     edges = [edge for line in lines for edge in (line.argmax(axis=1), line.shape[1] - line[:, ::-1].argmax(axis=1))]
     return np.where(np.any(lines[1], axis=1)[:, None], np.stack(edges, axis=1), 0).astype(np.uint32)

@@ -25,9 +25,15 @@ _FACE = 1e-8
 _REACH = 5.3
 """Standard deviations at which a Gaussian is 10⁻⁶ of its peak."""
 _CPU_LANES, _CUDA_LANES = 16, 4
-"""Nodes in a packet: a vector register of a processor, or what a thread of CUDA reads at once."""
+"""Nodes in a packet.
+
+It is a vector register of a processor, or what a thread of CUDA reads at once.
+"""
 _STACK = 1 << 17
-"""Nodes of all environments that a CPU processes at once, so that they stay in a core's cache."""
+"""Nodes of all environments that a CPU processes at once.
+
+So they stay in a core's cache.
+"""
 
 
 class ElasticSurround:
@@ -168,7 +174,10 @@ class ElasticSurround:
         self._overlaps.zero_()
 
     def launch(self) -> None:
-        """Launch the kernels for ``overlap``, ``window`` and ``deepest``; nothing waits for the device."""
+        """Launch the kernels for ``overlap``, ``window`` and ``deepest``.
+
+        Nothing waits for the device.
+        """
         ny = self.grid.shape[0]
         for first in self._firsts:
             envs = min(len(self._field), len(self.lost) - first)
@@ -188,7 +197,10 @@ class ElasticSurround:
             self._launch(kernels.without_lost, lines, [first, self.lost, *shown])
 
     def _smooth(self, first: int, envs: int, before: np.ndarray, blur: _Gaussian, k: int, *, imposes: bool) -> np.ndarray:
-        """Launch the ``k``-th Gaussian of a field that reaches ``before`` (x, y) nodes around the overlap; returns how far it reaches."""
+        """Launch the ``k``-th Gaussian of a field; returns how far it reaches.
+
+        The field reaches ``before`` (x, y) nodes around the overlap.
+        """
         _, lines, count = self._field.shape
         after = np.minimum(before + blur.reach, self._reaches[k])
         threads = 1 if self.device.is_cpu else count
@@ -224,7 +236,10 @@ class _Gaussian:
 
 
 def _blocks(matrix: np.ndarray, size: int, device: Any) -> tuple[np.ndarray, wp.array]:
-    """Rows of a matrix (n, n) in blocks, (n, blocks, size), float32, and the columns of each, from and to, that are not 0."""
+    """Rows of a matrix (n, n) in blocks, and the columns of each that are not 0.
+
+    Shapes (n, blocks, size), float32; columns from and to.
+    """
     count = -(-len(matrix) // size)
     padded = np.zeros((count * size, len(matrix)), np.float32)
     padded[: len(matrix)] = matrix
@@ -234,7 +249,10 @@ def _blocks(matrix: np.ndarray, size: int, device: Any) -> tuple[np.ndarray, wp.
 
 
 def _nodes(packets: wp.array, rows: int | None = None, columns: int | None = None) -> wp.array:
-    """The first rows and columns of an array of packets (B, n, m), node by node, in the same memory; None is all."""
+    """The first rows and columns of an array of packets (B, n, m), node by node.
+
+    They are in the same memory; None is all.
+    """
     *shape, count = packets.shape
     kind: Any = packets.dtype
     nodes: Any = wp.array(

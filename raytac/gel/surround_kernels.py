@@ -93,7 +93,9 @@ def along_rows(
     # outputs
     out: wp.array3d(dtype=Any),
 ):
-    """Σ_k weights[k, i] source[j, k] of ``ROWS`` rows j; ``imposes``: or the overlap if that is more.
+    """Σ_k weights[k, i] source[j, k] of ``ROWS`` rows j.
+
+    With ``imposes`` it is the overlap if that is more.
 
     The others are as of ``along_columns``.
     """
@@ -229,7 +231,9 @@ def lift_off(
     height: wp.array3d(dtype=Any),
     lost: wp.array(dtype=wp.int32),
 ):
-    """Heights rest − w along one row; environments in which one is below ``lowest`` are ``lost``.
+    """Heights rest − w along one row.
+
+    Environments in which one is below ``lowest`` are ``lost``.
 
     ``before``: nodes along x and y to which the field reaches around the ``window``; none is too low if the deepest overlap is
     ``shallow``, since the gel moves by no more.

@@ -210,7 +210,7 @@ class DeviceMode(ABC):
         with RENDERER:
             self._finish()
             # Copies: on the CPU Dr.Jit reads NumPy memory in place, when the kernel runs.
-            ink = None if surface.ink is None else surface.ink.copy()
+            ink = None if (checked := checked_ink(surface)) is None else checked.copy()
             surface = replace(surface, height=surface.height.copy(), contact=surface.contact.copy(), ink=ink)
             heights, failed = self._checked(surface)
             pressed = self._pressed(surface, heights, failed)
@@ -243,7 +243,10 @@ class DeviceMode(ABC):
             dr.sync_thread()
 
     def _pressed(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> list[int]:
-        """Environments to render: a power of two, the others are at rest, their dots where the first pad at rest had them."""
+        """Environments to render: a power of two.
+
+        The others are at rest, their dots where the first pad at rest had them.
+        """
         rest = surface.grid.rest.astype(np.float32)
         differ = failed | surface.contact.any(axis=(1, 2)) | (heights != rest).any(axis=(1, 2))
         if surface.ink is not None and not differ.all():

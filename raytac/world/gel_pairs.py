@@ -17,7 +17,10 @@ from raytac.shapes.part import Part, mesh_part
 from raytac.specs.sensor import GelpadSpec
 
 _WIDER = 1e-5
-"""Share by which a gel that is shown is wider, so that rounding does not leave out nodes on the edge of one of the same size."""
+"""Share by which a gel that is shown is wider.
+
+So rounding does not leave out nodes on the edge of one of the same size.
+"""
 _PITCH = 0.8e-3
 """Spacing of the vertices of a gel's surface [m]; a dome of 100 mm is off by 1 µm."""
 
@@ -39,7 +42,10 @@ class GelPairs:
         self._modulus = np.array([gel.youngs_modulus for gel in gels])
 
     def gels(self, pad: int) -> list[tuple[tuple[Part, ...], float]]:
-        """Gels of all pads as ``PressedGel`` takes them, 0 for those that ``pad`` does not touch; empty if it touches none."""
+        """Gels of all pads as ``PressedGel`` takes them.
+
+        0 for those that ``pad`` does not touch; empty if it touches none.
+        """
         others = {i + j - pad for i, j, _ in self.pairs if pad in (i, j)}
         shares = [k in others and self._modulus[k] / (self._modulus[pad] + self._modulus[k]) for k in range(len(self._modulus))]
         return [(parts, float(share)) for parts, share in zip(self._shown, shares, strict=True)] if others else []

@@ -72,12 +72,12 @@ def test_every_name_is_registered_alone_and_as_a_vector() -> None:
 _BY_NAME = """
 import sys, gymnasium
 try:
-    gymnasium.make("raytac/RollBall-v1")
+    gymnasium.make("raytac/RollBall-v2")
 except gymnasium.error.NamespaceNotFound:
     assert "raytac" not in sys.modules
     print("needs an import")
-print(type(gymnasium.make("raytac.envs:raytac/RollBall-v1", tactile=None).unwrapped).__name__)
-print(gymnasium.make_vec("raytac.envs:raytac/RollBall-v1", 2, "vector_entry_point", tactile=None).num_envs)
+print(type(gymnasium.make("raytac.envs:raytac/RollBall-v2", tactile=None).unwrapped).__name__)
+print(gymnasium.make_vec("raytac.envs:raytac/RollBall-v2", 2, "vector_entry_point", tactile=None).num_envs)
 """
 
 

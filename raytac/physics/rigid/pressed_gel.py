@@ -1,4 +1,7 @@
-"""``PressedGel``: the gel of one pad under bodies and other gels, in all environments at once."""
+"""``PressedGel``: the gel of one pad under bodies and other gels.
+
+In all environments at once.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,9 @@ class Pressed:
 
 
 class PressedGel:
-    """Undersides of bodies on the nodes of a pad, up to the resting gel, and the surface under them.
+    """Undersides of bodies on the nodes of a pad, and the surface under them.
+
+    Undersides reach up to the resting gel.
 
     Another gel is a body too, which takes its share of the overlap (see ``GelPairs``). ``launch`` works without the host, so that it can
     be recorded; ``of`` copies from and to NumPy around it. Poses that are not finite show nothing, nor do bodies below the bonded face.

@@ -26,9 +26,15 @@ class PadLevel:
     d_hat: float
     """Distance below which object and coat repel [m]."""
     block: tuple[int, int, int] | None = None
-    """Cells along x, y and z that share their change of volume; None: each tetrahedron has its own."""
+    """Cells along x, y and z that share their change of volume.
+
+    None: each tetrahedron has its own.
+    """
     own_volume: float = 0.25
-    """Stiffness of a tetrahedron of a block against a change of its own volume, in μ; steadies the solver."""
+    """Stiffness of a tetrahedron of a block against a change of its own volume, in μ.
+
+    It steadies the solver.
+    """
 
 
 PAD_LEVELS = {

@@ -112,7 +112,10 @@ class SceneSettings(_Settings):
     """Accuracy of a soft scene, whose steps have a physical duration."""
 
     slip: float = 5e-7
-    """Elastic slip ε of a contact [m]: under a share r of the friction limit it gives way by ε (1 − √(1 − r)), and keeps it."""
+    """Elastic slip ε of a contact [m].
+
+    Under a share r of the friction limit it gives way by ε (1 − √(1 − r)), and keeps it.
+    """
     tolerance: float = 2e-8
     """A step is solved when no vertex would move further [m]; small against ``slip``."""
     linear_tolerance: float = 1e-6
@@ -140,7 +143,10 @@ class PressControl(_Settings):
     stiffenings: int = 4
     """Most such increases in one step."""
     friction_tolerance: float = 1e-3
-    """Share by which the normal forces that bound friction may be off in a solved step; a search for a force needs it to be small."""
+    """Share by which normal forces that bound friction may be off in a solved step.
+
+    A search for a force needs it to be small.
+    """
     depth_tolerance: float = 1e-6
     """A depth is reached within this [m]."""
     force_tolerance: float = 5e-4

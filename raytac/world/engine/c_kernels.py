@@ -30,7 +30,10 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _ROWS = wp.constant(wp.int32(ROWS))
 _SLIPPERY = wp.constant(wp.float64(1e-5))
-"""Factor of the friction across a gap that stays open; of all coefficients and the cone, so that they fit each other."""
+"""Factor of the friction across a gap that stays open.
+
+It is that of all coefficients and of the cone, so that they fit each other.
+"""
 _SLOWEST = wp.constant(wp.float64(1e-9))
 """Least speed by which a gap is divided [m/s]."""
 _LARGEST_SPEED = wp.constant(wp.float64(LARGEST_SPEED))

@@ -1,4 +1,6 @@
-"""Functions of the kernels of both engines: gaps between hard geoms, and lifts of slides that begin or end.
+"""Functions of the kernels of both engines.
+
+They are for gaps between hard geoms, and for lifts of slides that begin or end.
 
 Gaps are in the precision of the engine.
 """
@@ -45,7 +47,10 @@ def is_among(geoms: wp.array(dtype=wp.int32), geom: wp.int32) -> wp.int32:
 
 @wp.func
 def is_box(boxes: wp.array(dtype=Any), geom: wp.int32) -> wp.bool:
-    """True if the half edges ``boxes`` of a geom are those of a box; False of −1, which is a flex."""
+    """True if the half edges ``boxes`` of a geom are those of a box.
+
+    False of −1, which is a flex.
+    """
     if geom < 0:
         return False
     return wp.float64(boxes[geom][0]) > _0
@@ -85,7 +90,10 @@ def is_open(gap: Any, ahead: Any, step: Any) -> wp.bool:
 
 @wp.func
 def closing(gap: Any, passed: wp.bool):
-    """Gap [m] that a step closes: all of it, or a share of a penetration; one that none does if ``passed``."""
+    """Gap [m] that a step closes: all of it, or a share of a penetration.
+
+    If ``passed`` it is one that no step closes.
+    """
     if passed:
         return type(gap)(_FAR)
     return wp.where(gap > type(gap)(_0), gap, type(gap)(_BACK) * gap)
@@ -108,7 +116,9 @@ def slide_force(
 def correct_lift(
     slots: Slots, i: wp.int32, pad: wp.int32, body: wp.int32, ahead: wp.float64, slide: wp.float64, step: wp.float64
 ):
-    """Set the lift of one contact; returns whether it did not fit, and by how much the reference of its normal row falls.
+    """Set the lift of one contact.
+
+    Returns whether it did not fit, and by how much the reference of its normal row falls.
 
     A slide that is faster by a lift that is larger asks for more: the first guess follows from the contact's own mass, the others by
     secants. ``ahead``: velocity of the normal row at the end of the step; ``slide``: root of the sum of squares of all ``slide_force``.
