@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import warp as wp
 
+from raytac.physics.rigid.lift_kernels import Lifts, solve_lifts
 from raytac.physics.rigid.motion_kernels import Frames
-from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
+from raytac.physics.rigid.world_kernels import ROWS, Differences, Gels, Slots, Steps
 from raytac.world.world_state import LARGEST_SPEED
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -23,8 +24,6 @@ _LEAST = wp.constant(wp.float64(1e-6))
 """Least coefficient of friction, which MuJoCo wants positive."""
 _BACK = wp.constant(wp.float64(0.1))
 """Share of a penetration that a step takes back."""
-_FITS = wp.constant(wp.float64(0.005))
-"""Error of a lift over the normal force that is left."""
 _BESIDE = wp.constant(wp.float64(1e-4))
 """Distance from a box from which a point of a gap is not on it [m]."""
 _OPEN = wp.constant(wp.float64(2e-5))
@@ -295,6 +294,23 @@ def passes(
     return wp.max(off, by) > _BESIDE
 
 
+@wp.func
+def write_gel_references(memory: Memory, steps: Steps, slots: Slots, i: wp.int32):
+    """Set reference accelerations of the last rows."""
+    env, step = steps.envs[i], steps.length[i]
+    velocity, reference = doubles(memory, env, memory.efc_vel), doubles(memory, env, memory.efc_aref)
+    row = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
+    for pad in range(slots.held.shape[1]):
+        for body in range(slots.held.shape[2]):
+            if slots.held[i, pad, body] != 0:
+                m = wp.int32(0)
+                while m < _ROWS:
+                    wanted = slots.force[i, pad, body, m] * slots.regularisation[i, pad, body, m]
+                    reference[row] = wanted - velocity[row] / step
+                    row += 1
+                    m += 1
+
+
 @wp.kernel
 def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(dtype=wp.int32), boxes: wp.array(dtype=wp.vec3d)):
     """Set reference accelerations of the last rows and ``hard`` geoms, after MuJoCo's own.
@@ -340,69 +356,39 @@ def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(
                 contact[n + memory.mu] *= _SLIPPERY
                 for m in range(_ROWS - 1):
                     contact[n + memory.friction + m] *= _SLIPPERY
-    row = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
-    for pad in range(slots.held.shape[1]):
-        for body in range(slots.held.shape[2]):
-            if slots.held[i, pad, body] != 0:
-                m = wp.int32(0)
-                while m < _ROWS:
-                    wanted = slots.force[i, pad, body, m] * slots.regularisation[i, pad, body, m]
-                    reference[row] = wanted - velocity[row] / step
-                    row += 1
-                    m += 1
+    write_gel_references(memory, steps, slots, i)
 
 
 @wp.kernel
-def correct_lifts(memory: Memory, steps: Steps, slots: Slots):
-    """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step.
-
-    A slide that is faster by a lift that is larger asks for more: the first guess follows from the contact's own mass, the others by
-    secants. ``steps.slides`` stays 1 until the lift fits.
-    """
+def correct_lifts(
+    memory: Memory, steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, vary: Differences, gels: Gels
+):
+    """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step; see ``solve_lifts``."""
     i = wp.tid()
     if steps.slides[i] == 0 or steps.lost[i] != 0:
         return
     env, step = steps.envs[i], steps.length[i]
     before = doubles(memory, env, memory.efc_vel)
-    reference = doubles(memory, env, memory.efc_aref)
     acceleration = doubles(memory, env, memory.qacc)
-    # The next solve, which differs by a lift, begins with this solution.
-    guess = doubles(memory, env, memory.qacc_warmstart)
-    for k in range(memory.nv):
-        guess[k] = acceleration[k]
-    row = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
-    slides = wp.int32(0)
+    first = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
+    row, sound = wp.int32(first), wp.bool(True)
     for pad in range(slots.held.shape[1]):
         for body in range(slots.held.shape[2]):
             if slots.held[i, pad, body] != 0:
-                lift = slots.lift[i, pad, body]
-                regular, sheared = slots.regularisation[i, pad, body, 0], slots.regularisation[i, pad, body, 1]
-                friction, ratio = wp.max(slots.friction[i, pad, body, 0], _LEAST), sheared / regular
-                ahead = before[row] + step * row_times(memory, env, row, acceleration)
-                normal = wp.max(slots.force[i, pad, body, 0] + lift - ahead / (regular * step), _0)
-                total = wp.float64(0.0)
-                m = wp.int32(1)
+                m = wp.int32(0)
                 while m < _ROWS:
-                    ahead = before[row + m] + step * row_times(memory, env, row + m, acceleration)
-                    part = slots.force[i, pad, body, m] - ahead / (slots.regularisation[i, pad, body, m] * step)
-                    part *= friction / wp.max(slots.friction[i, pad, body, m - 1], _LEAST)
-                    total += part * part
+                    ahead = before[row] + step * row_times(memory, env, row, acceleration)
+                    velocity[i, pad, body, m] = ahead
+                    sound = sound and wp.isfinite(ahead)
+                    row += 1
                     m += 1
-                lacks = friction * ratio * wp.max(wp.sqrt(total) - friction * normal, _0) - lift
-                if wp.abs(lacks) > _FITS * normal:
-                    slides = 1
-                    tried = slots.tried[i, pad, body]
-                    square = friction * friction * ratio
-                    more = lacks * (_1 + square * slots.compliance[i, pad, body] / sheared / (_1 + square))
-                    if not wp.isnan(tried[0]) and tried[1] != lacks:
-                        more = lacks * (lift - tried[0]) / (tried[1] - lacks)
-                    slots.tried[i, pad, body] = wp.vec2d(lift, lacks)
-                    more = wp.max(more, -lift)
-                    slots.lift[i, pad, body] = lift + more
-                    slots.force[i, pad, body, 0] = slots.force[i, pad, body, 0] - more
-                    reference[row] = reference[row] - more * regular
-                row += _ROWS
-    steps.slides[i] = slides
+    if sound:
+        # The next solve, which differs by lifts, begins with this solution.
+        guess = doubles(memory, env, memory.qacc_warmstart)
+        for k in range(memory.nv):
+            guess[k] = acceleration[k]
+    solve_lifts(steps, slots, velocity, lifts, vary, gels, i)
+    write_gel_references(memory, steps, slots, i)
 
 
 @wp.kernel

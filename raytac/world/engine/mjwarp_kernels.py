@@ -15,8 +15,9 @@ from __future__ import annotations
 
 import warp as wp
 
+from raytac.physics.rigid.lift_kernels import Lifts, solve_lifts
 from raytac.physics.rigid.motion_kernels import Frames
-from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
+from raytac.physics.rigid.world_kernels import ROWS, Differences, Gels, Slots, Steps
 from raytac.world.world_state import LARGEST_SPEED
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -28,8 +29,6 @@ _LEAST = wp.constant(wp.float64(1e-6))
 """Least coefficient of friction, which MuJoCo wants positive."""
 _BACK = wp.constant(wp.float32(0.1))
 """Share of a penetration that a step takes back."""
-_FITS = wp.constant(wp.float64(0.005))
-"""Error of a lift over the normal force that is left."""
 _BESIDE = wp.constant(wp.float32(1e-4))
 """Distance from a box from which a point of a gap is not on it [m]."""
 _OPEN = wp.constant(wp.float32(2e-5))
@@ -120,8 +119,6 @@ class Own:
     """Index; −1 without a contact."""
     scale: wp.array3d(dtype=wp.float64)
     """t."""
-    sliding: wp.array(dtype=wp.int32)
-    """``Steps.slides`` before the last correction, (B,)."""
 
 
 @wp.struct
@@ -445,54 +442,40 @@ def write_hard_references(
 
 
 @wp.kernel
-def begin_correction(worlds: Worlds, steps: Steps, own: Own):
-    """Note where slides are unknown; the next solve, with another lift, begins with this one."""
+def correct_lifts(
+    worlds: Worlds, own: Own, steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, vary: Differences,
+    gels: Gels,
+):  # fmt: skip
+    """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step; see ``solve_lifts``."""
     i = wp.tid()
-    own.sliding[i] = steps.slides[i]
-    steps.slides[i] = 0
+    sound = wp.bool(True)
     for k in range(worlds.nv):
-        worlds.qacc_warmstart[i, k] = worlds.qacc[i, k]
-
-
-@wp.kernel
-def correct_lifts(worlds: Worlds, own: Own, steps: Steps, slots: Slots):
-    """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step.
-
-    A slide that is faster by a lift that is larger asks for more: the first guess follows from the contact's own mass, the others by
-    secants. ``steps.slides`` stays 1 until the lift fits.
-    """
-    i, pad, body = wp.tid()
-    k = own.contact[i, pad, body]
-    if k < 0 or own.sliding[i] == 0 or steps.lost[i] != 0:
+        sound = sound and wp.isfinite(worlds.qacc[i, k])
+    if sound:
+        # The next solve, which may differ by lifts, begins with this solution.
+        for k in range(worlds.nv):
+            worlds.qacc_warmstart[i, k] = worlds.qacc[i, k]
+    if steps.slides[i] == 0 or steps.lost[i] != 0:
         return
-    row = worlds.efc_address[k, 0]
-    if row < 0 or worlds.efc_address[k, _ROWS - 1] < 0:
-        return
-    step, t, lift = steps.length[i], own.scale[i, pad, body], slots.lift[i, pad, body]
-    regular, sheared = slots.regularisation[i, pad, body, 0], slots.regularisation[i, pad, body, 1]
-    friction, ratio = wp.max(slots.friction[i, pad, body, 0], _LEAST), sheared / regular
-    ahead = wp.float64(worlds.vel[i, row]) + step * row_times(worlds, i, row, worlds.qacc)
-    normal = wp.max(slots.force[i, pad, body, 0] + lift - ahead / (regular * step), _0)
-    total = wp.float64(0.0)
-    for m in range(1, _ROWS):
-        other, factor = worlds.efc_address[k, m] + 0, wp.where(is_scaled(m), t, _1)
-        ahead = (wp.float64(worlds.vel[i, other]) + step * row_times(worlds, i, other, worlds.qacc)) / factor
-        part = slots.force[i, pad, body, m] - ahead / (slots.regularisation[i, pad, body, m] * step)
-        part *= friction / wp.max(slots.friction[i, pad, body, m - 1], _LEAST)
-        total += part * part
-    lacks = friction * ratio * wp.max(wp.sqrt(total) - friction * normal, _0) - lift
-    if wp.abs(lacks) > _FITS * normal:
-        wp.atomic_max(steps.slides, i, 1)
-        tried = slots.tried[i, pad, body]
-        square = friction * friction * ratio
-        more = lacks * (_1 + square * slots.compliance[i, pad, body] / sheared / (_1 + square))
-        if not wp.isnan(tried[0]) and tried[1] != lacks:
-            more = lacks * (lift - tried[0]) / (tried[1] - lacks)
-        more = wp.max(more, -lift)
-        slots.tried[i, pad, body] = wp.vec2d(lift, lacks)
-        slots.lift[i, pad, body] = lift + more
-        slots.force[i, pad, body, 0] = slots.force[i, pad, body, 0] - more
-        worlds.aref[i, row] = wp.float32(wp.float64(worlds.aref[i, row]) - more * regular)
+    step = steps.length[i]
+    for pad in range(slots.held.shape[1]):
+        for body in range(slots.held.shape[2]):
+            k = own.contact[i, pad, body]
+            if k >= 0:
+                for m in range(_ROWS):
+                    row = worlds.efc_address[k, m] + 0
+                    if row < 0:
+                        return
+                    ahead = wp.float64(worlds.vel[i, row]) + step * row_times(worlds, i, row, worlds.qacc)
+                    velocity[i, pad, body, m] = ahead / wp.where(is_scaled(m), own.scale[i, pad, body], _1)
+    solve_lifts(steps, slots, velocity, lifts, vary, gels, i)
+    for pad in range(slots.held.shape[1]):
+        for body in range(slots.held.shape[2]):
+            k = own.contact[i, pad, body]
+            if k >= 0:
+                row = worlds.efc_address[k, 0]
+                wanted = slots.force[i, pad, body, 0] * slots.regularisation[i, pad, body, 0]
+                worlds.aref[i, row] = wp.float32(wanted - wp.float64(worlds.vel[i, row]) / step)
 
 
 @wp.kernel
