@@ -120,10 +120,11 @@ class GelContact:
         together = min(pads * (count + pads), TOGETHER)
         lifts = self._struct(Lifts(), (num_envs, together), {"slot": wp.vec2i, "reach": wp.float64})
         self._struct(lifts, (num_envs, 3, together), {"lift": wp.float64, "lacks": wp.float64})
+        lifts.carrier = self._gels.carrier
         lifts.least = self._zeros((num_envs,), wp.float64)
         lifts.jacobian = self._zeros((num_envs, together, together), wp.float64)
         lifts.work = self._zeros((num_envs, together, 2 * together), wp.float64)
-        self.lifts = [lifts, self.numbers, self._gels]
+        self.lifts: list[Any] = [lifts, self.numbers]
         self.force, self.velocity = (self._zeros((*slots, world.ROWS), wp.float64) for _ in range(2))
         self.acceleration, self.rolling = self._zeros(slots, wp.float64), self._zeros(slots, wp.vec2d)
         self.wrenches = self._zeros(all_pads, wp.spatial_vectord)
@@ -140,6 +141,10 @@ class GelContact:
         self._searches = [*([(self.search, 0, 0)] if self.search.pairs else []), *self._pairs]
         for search, _, _ in self._searches:
             search.reserve(search.pairs)
+
+    def expect_lifts(self, solves: int, share: np.ndarray) -> None:
+        """Name the most solves for ``lifts``, and the share (bodies of the model,) of their acceleration that comes."""
+        self.lifts[0].solves, self.lifts[0].share = solves, _array(share, wp.float64, self.device)
 
     def begin(self, *, whole: bool = False) -> None:
         """Find contacts from ``frames``, choose steps (unless ``whole``), and set the rows."""

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.physics.rigid.world_kernels import ROWS, Differences, Gels, Slots, Steps
+from raytac.physics.rigid.world_kernels import ROWS, Differences, Slots, Steps
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
@@ -50,6 +50,10 @@ class Lifts:
     """Most solves of MuJoCo's before that of the step."""
     least: wp.array(dtype=wp.float64)
     """Least error of all lifts so far [N], (n,)."""
+    carrier: wp.array(dtype=wp.int32)
+    """Body of the model that carries each pad, (pads,)."""
+    share: wp.array(dtype=wp.float64)
+    """Of the acceleration of each body of the model that comes, as damping is implicit (``ImplicitDamping``)."""
     slot: wp.array2d(dtype=wp.vec2i)
     """Pad and body of each contact, (n, K)."""
     reach: wp.array2d(dtype=wp.float64)
@@ -107,18 +111,15 @@ def slide_of(slots: Slots, velocity: wp.array4d(dtype=wp.float64), step: wp.floa
 
 
 @wp.func
-def shared_compliance(vary: Differences, gels: Gels, env: wp.int32, one: wp.vec2i, two: wp.vec2i) -> wp.float64:
-    """1/m [1/kg] by which a force at a contact changes the speed at another; negative where that is the force on the pad."""
-    pads, bodies = wp.vec2i(gels.carrier[one[0]], gels.carrier[two[0]]), wp.vec2i(vary.carrier[one[1]], vary.carrier[two[1]])
+def shared_compliance(lifts: Lifts, vary: Differences, env: wp.int32, one: wp.vec2i, two: wp.vec2i) -> wp.float64:
+    """1/m [1/kg] by which a force at a contact changes the speed at another; negative where it is on one's body and two's pad."""
     result = wp.float64(0.0)
-    if bodies[0] == bodies[1]:
-        result += vary.inverse_weight[env, bodies[0]]
-    if pads[0] == pads[1]:
-        result += vary.inverse_weight[env, pads[0]]
-    if bodies[0] == pads[1]:
-        result -= vary.inverse_weight[env, bodies[0]]
-    if pads[0] == bodies[1]:
-        result -= vary.inverse_weight[env, pads[0]]
+    for m in range(2):
+        for n in range(2):
+            body = wp.where(m == 0, lifts.carrier[one[0]], vary.carrier[one[1]])
+            if body == wp.where(n == 0, lifts.carrier[two[0]], vary.carrier[two[1]]):
+                weight = lifts.share[body] * vary.inverse_weight[env, body]
+                result += wp.where(m == n, weight, -weight)
     return result
 
 
@@ -147,8 +148,8 @@ def eliminate(work: wp.array3d(dtype=wp.float64), i: wp.int32, count: wp.int32, 
 
 @wp.func
 def begin_jacobian(
-    slots: Slots, velocity: wp.array4d(dtype=wp.float64), step: wp.float64, lifts: Lifts, vary: Differences, gels: Gels, env: wp.int32,
-    i: wp.int32, count: wp.int32,
+    slots: Slots, velocity: wp.array4d(dtype=wp.float64), step: wp.float64, lifts: Lifts, vary: Differences, env: wp.int32, i: wp.int32,
+    count: wp.int32,
 ):  # fmt: skip
     """−Q P⁻¹, of contacts that do not slide −1; see the module."""
     for j in range(count):
@@ -157,7 +158,7 @@ def begin_jacobian(
         slide = slide_of(slots, velocity, step, i, slot)
         for k in range(count):
             other = lifts.slot[i, k]
-            compliance = shared_compliance(vary, gels, env, slot, other) / regular
+            compliance = shared_compliance(lifts, vary, env, slot, other) / regular
             push = slide_of(slots, velocity, step, i, other).push
             own = wp.where(j == k, slide.cone, _0)
             # Transposed, since P comes on the right.
@@ -176,7 +177,7 @@ def begin_jacobian(
 
 @wp.func
 def solve_lifts(
-    steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, vary: Differences, gels: Gels, i: wp.int32
+    steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, vary: Differences, i: wp.int32
 ):
     """Set the lifts of an environment, and f₀ of its normal rows, after a solve of MuJoCo's.
 
@@ -206,17 +207,17 @@ def solve_lifts(
         steps.slides[i] = 0
         return
     if solve == 1:
-        begin_jacobian(slots, velocity, step, lifts, vary, gels, env, i, count)
+        begin_jacobian(slots, velocity, step, lifts, vary, env, i, count)
     elif wp.isfinite(error):
         for j in range(count):
             length, change = wp.float64(0.0), lifts.lacks[i, 2, j] - lifts.lacks[i, 1, j]
             for k in range(count):
-                if j == k or shared_compliance(vary, gels, env, lifts.slot[i, j], lifts.slot[i, k]) != _0:
+                if j == k or shared_compliance(lifts, vary, env, lifts.slot[i, j], lifts.slot[i, k]) != _0:
                     moved = lifts.lift[i, 2, k] - lifts.lift[i, 1, k]
                     length += moved * moved
                     change -= lifts.jacobian[i, j, k] * moved
             for k in range(count):
-                if length > _0 and (j == k or shared_compliance(vary, gels, env, lifts.slot[i, j], lifts.slot[i, k]) != _0):
+                if length > _0 and (j == k or shared_compliance(lifts, vary, env, lifts.slot[i, j], lifts.slot[i, k]) != _0):
                     moved = lifts.lift[i, 2, k] - lifts.lift[i, 1, k]
                     lifts.jacobian[i, j, k] = lifts.jacobian[i, j, k] + change / length * moved
     falls = solve == 1 or error < _FALLS * lifts.least[i]

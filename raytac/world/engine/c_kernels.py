@@ -14,7 +14,7 @@ import warp as wp
 
 from raytac.physics.rigid.lift_kernels import Lifts, solve_lifts
 from raytac.physics.rigid.motion_kernels import Frames
-from raytac.physics.rigid.world_kernels import ROWS, Differences, Gels, Slots, Steps
+from raytac.physics.rigid.world_kernels import ROWS, Differences, Slots, Steps
 from raytac.world.world_state import LARGEST_SPEED
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -361,7 +361,7 @@ def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(
 
 @wp.kernel
 def correct_lifts(
-    memory: Memory, steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, vary: Differences, gels: Gels
+    memory: Memory, steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, vary: Differences
 ):
     """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step; see ``solve_lifts``."""
     i = wp.tid()
@@ -387,7 +387,7 @@ def correct_lifts(
         guess = doubles(memory, env, memory.qacc_warmstart)
         for k in range(memory.nv):
             guess[k] = acceleration[k]
-    solve_lifts(steps, slots, velocity, lifts, vary, gels, i)
+    solve_lifts(steps, slots, velocity, lifts, vary, i)
     write_gel_references(memory, steps, slots, i)
 
 

@@ -17,7 +17,7 @@ import warp as wp
 
 from raytac.physics.rigid.lift_kernels import Lifts, solve_lifts
 from raytac.physics.rigid.motion_kernels import Frames
-from raytac.physics.rigid.world_kernels import ROWS, Differences, Gels, Slots, Steps
+from raytac.physics.rigid.world_kernels import ROWS, Differences, Slots, Steps
 from raytac.world.world_state import LARGEST_SPEED
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -444,7 +444,6 @@ def write_hard_references(
 @wp.kernel
 def correct_lifts(
     worlds: Worlds, own: Own, steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, vary: Differences,
-    gels: Gels,
 ):  # fmt: skip
     """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step; see ``solve_lifts``."""
     i = wp.tid()
@@ -468,7 +467,7 @@ def correct_lifts(
                         return
                     ahead = wp.float64(worlds.vel[i, row]) + step * row_times(worlds, i, row, worlds.qacc)
                     velocity[i, pad, body, m] = ahead / wp.where(is_scaled(m), own.scale[i, pad, body], _1)
-    solve_lifts(steps, slots, velocity, lifts, vary, gels, i)
+    solve_lifts(steps, slots, velocity, lifts, vary, i)
     for pad in range(slots.held.shape[1]):
         for body in range(slots.held.shape[2]):
             k = own.contact[i, pad, body]
