@@ -142,9 +142,17 @@ class GelContact:
         for search, _, _ in self._searches:
             search.reserve(search.pairs)
 
-    def expect_lifts(self, solves: int, share: np.ndarray) -> None:
-        """Name the most solves for ``lifts``, and the share (bodies of the model,) of their acceleration that comes."""
-        self.lifts[0].solves, self.lifts[0].share = solves, _array(share, wp.float64, self.device)
+    def expect_lifts(self, solves: int, share: np.ndarray, inverse_weight: np.ndarray) -> None:
+        """Name the most solves for ``lifts``; see ``Lifts``.
+
+        Args:
+            share: of bodies of the model, (nbody,).
+            inverse_weight: ``body_invweight0`` (nbody, 2).
+        """
+        lifts, touched, turning = self.lifts[0], self.numbers.carrier.numpy()[: self._touched.bodies], np.zeros(len(share))
+        turning[touched] = inverse_weight[touched, 1] / np.maximum(inverse_weight[touched, 0], np.finfo(float).tiny)
+        lifts.solves, lifts.share = solves, _array(share, wp.float64, self.device)
+        lifts.turning = _array(turning, wp.float64, self.device)
 
     def begin(self, *, whole: bool = False) -> None:
         """Find contacts from ``frames``, choose steps (unless ``whole``), and set the rows."""
@@ -321,6 +329,7 @@ _SLOTS: dict[str, Any] = {
     "place": wp.vec3d,
     "frame": wp.mat33d,
     "bend": wp.vec2d,
+    "arm": wp.vec3d,
     "lift": wp.float64,
     "wrench": wp.spatial_vectord,
     "opposite": wp.spatial_vectord,

@@ -8,7 +8,7 @@ together:
     Δℓ = −P Δp,  P = D + Δt G d·C d,    D = 1 + μ² r
     Δ(μ r (T − μ N) − ℓ) = Q Δp,        Q = D (1 + Δt G n·C d)
 
-with C the inverse masses that two contacts share, as if bodies did not turn. −Q P⁻¹ begins the Jacobian. Each solve of MuJoCo's then
+with C the inverse mass and inertia that two contacts share, those of bodies alone. −Q P⁻¹ begins the Jacobian. Each solve of MuJoCo's then
 corrects its rows by Schubert's update, in the columns that C couples (L. K. Schubert, Math. Comp. 24, 1970): of one contact that is the
 secant method.
 """
@@ -54,6 +54,8 @@ class Lifts:
     """Body of the model that carries each pad, (pads,)."""
     share: wp.array(dtype=wp.float64)
     """Of the acceleration of each body of the model that comes, as damping is implicit (``ImplicitDamping``)."""
+    turning: wp.array(dtype=wp.float64)
+    """Mass over inertia of the bodies of the model that pads touch [1/m²], of others 0."""
     slot: wp.array2d(dtype=wp.vec2i)
     """Pad and body of each contact, (n, K)."""
     reach: wp.array2d(dtype=wp.float64)
@@ -124,6 +126,18 @@ def shared_compliance(lifts: Lifts, vary: Differences, env: wp.int32, one: wp.ve
 
 
 @wp.func
+def change_of_speed(
+    slots: Slots, lifts: Lifts, vary: Differences, env: wp.int32, i: wp.int32, one: wp.vec2i, two: wp.vec2i, along: wp.vec3d, push: wp.vec3d
+) -> wp.float64:
+    """a·C b [1/kg]: acceleration at contact one along a by a force b at contact two."""
+    result, body = shared_compliance(lifts, vary, env, one, two) * wp.dot(along, push), vary.carrier[one[1]]
+    if body == vary.carrier[two[1]]:
+        turn = wp.dot(wp.cross(slots.arm[i, one[0], one[1]], along), wp.cross(slots.arm[i, two[0], two[1]], push))
+        result += lifts.share[body] * lifts.turning[body] * vary.inverse_weight[env, body] * turn
+    return result
+
+
+@wp.func
 def eliminate(work: wp.array3d(dtype=wp.float64), i: wp.int32, count: wp.int32, columns: wp.int32) -> wp.bool:
     """Solve for the ``columns`` after the first ``count`` in place, by Gauss and Jordan; False if singular."""
     for k in range(count):
@@ -158,13 +172,13 @@ def begin_jacobian(
         slide = slide_of(slots, velocity, step, i, slot)
         for k in range(count):
             other = lifts.slot[i, k]
-            compliance = shared_compliance(lifts, vary, env, slot, other) / regular
             push = slide_of(slots, velocity, step, i, other).push
             own = wp.where(j == k, slide.cone, _0)
             # Transposed, since P comes on the right.
-            work = own + wp.dot(slide.push, push) * compliance
+            work = own + change_of_speed(slots, lifts, vary, env, i, slot, other, slide.push, push) / regular
             lifts.work[i, k, j] = work
-            lifts.work[i, k, count + j] = -own - slide.cone * wp.dot(normal, push) * compliance
+            across = change_of_speed(slots, lifts, vary, env, i, slot, other, normal, push) / regular
+            lifts.work[i, k, count + j] = -own - slide.cone * across
             if j == k:
                 lifts.reach[i, j] = work / slide.cone
     sound = eliminate(lifts.work, i, count, count)

@@ -175,7 +175,8 @@ def set_rows(
 
     # A body that turns about its centre of mass moves the centre of pressure by the spread of the overlap per radian, less the height of
     # that centre over the gel: by nothing at all for a ball. Its principal tangents are those of the rows.
-    height = wp.dot(turn_of(pose) * touched.mass_centre[body] + place_of(pose) - centre, normal)
+    arm = centre - turn_of(pose) * touched.mass_centre[body] - place_of(pose)
+    height = -wp.dot(arm, normal)
     angle = _HALF * wp.atan2(_2 * spread[1], spread[0] - spread[2])
     mean, half = _HALF * (spread[0] + spread[2]), wp.length(wp.vec2d(_HALF * (spread[0] - spread[2]), spread[1]))
     cos, sin = wp.cos(angle), wp.sin(angle)
@@ -232,6 +233,7 @@ def set_rows(
             spreads[k], _LEAST
         )
         k += 1
+    slots.arm[i, pad, body] = rotation * arm
     slots.lift[i, pad, body] = lift
     slots.force[i, pad, body, 0] = spring.force - lift
     slots.force[i, pad, body, 1] = -(cos * pull[0] + sin * pull[1])

@@ -92,7 +92,7 @@ class CMujoco:
         indices = [_array(values) for values in (pads.sites, bodies, roots, last, model.dof_parentid)]
         gels, others = _array(pads.geoms[len(pads.bodies) :]), _array(pads.geoms)
         launch = partial(wp.launch, device="cpu")
-        contact.expect_lifts(_SOLVES, self._damping.body_share)
+        contact.expect_lifts(_SOLVES, self._damping.body_share, model.body_invweight0)
         frames = [memory, steps, *indices, wp.array(self._damping.share, dtype=wp.float64, device="cpu"), contact.frames]
         forces = [memory, slots, steps, contact.force, contact.velocity]
         self.read_frames = partial(launch, read_frames, dim=(num_envs, len(bodies)), inputs=frames)

@@ -98,7 +98,7 @@ class MujocoWarp:
         self._rows = 4 * self._contacts if rows is None else rows
         damping = ImplicitDamping(model)
         self._damped, self._always = damping.matters, int(pads.hard.any())
-        self._contact.expect_lifts(_SLIDES, damping.body_share)
+        self._contact.expect_lifts(_SLIDES, damping.body_share, model.body_invweight0)
         with wp.ScopedDevice(self.device):
             sizes = {name: num_envs for name in _VARIED if getattr(model, name).size}
             try:
