@@ -119,7 +119,7 @@ class GelContact:
         self.steps = self._struct(world.Steps(), (num_envs,), _STEPS)
         together = min(pads * (count + pads), TOGETHER)
         lifts = self._struct(Lifts(), (num_envs, together), {"slot": wp.vec2i, "reach": wp.float64})
-        self._struct(lifts, (num_envs, 3, together), {"lift": wp.float64, "lacks": wp.float64})
+        self._struct(lifts, (num_envs, 2, together), {"lift": wp.float64, "lacks": wp.float64})
         lifts.carrier = self._gels.carrier
         lifts.least = self._zeros((num_envs,), wp.float64)
         lifts.jacobian = self._zeros((num_envs, together, together), wp.float64)

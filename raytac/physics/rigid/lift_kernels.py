@@ -61,7 +61,7 @@ class Lifts:
     reach: wp.array2d(dtype=wp.float64)
     """Change of a contact's lift over its error, if it were alone."""
     lift: wp.array3d(dtype=wp.float64)
-    """Of the best solve, of that before, of the present one [N], (n, 3, K)."""
+    """Of the best solve and of the present one [N], (n, 2, K)."""
     lacks: wp.array3d(dtype=wp.float64)
     """By how much it is too small [N], likewise."""
     jacobian: wp.array3d(dtype=wp.float64)
@@ -127,7 +127,15 @@ def shared_compliance(lifts: Lifts, vary: Differences, env: wp.int32, one: wp.ve
 
 @wp.func
 def change_of_speed(
-    slots: Slots, lifts: Lifts, vary: Differences, env: wp.int32, i: wp.int32, one: wp.vec2i, two: wp.vec2i, along: wp.vec3d, push: wp.vec3d
+    slots: Slots,
+    lifts: Lifts,
+    vary: Differences,
+    env: wp.int32,
+    i: wp.int32,
+    one: wp.vec2i,
+    two: wp.vec2i,
+    along: wp.vec3d,
+    push: wp.vec3d,
 ) -> wp.float64:
     """a·C b [1/kg]: acceleration at contact one along a by a force b at contact two."""
     result, body = shared_compliance(lifts, vary, env, one, two) * wp.dot(along, push), vary.carrier[one[1]]
@@ -190,13 +198,11 @@ def begin_jacobian(
 
 
 @wp.func
-def solve_lifts(
-    steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, vary: Differences, i: wp.int32
-):
+def solve_lifts(steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, vary: Differences, i: wp.int32):
     """Set the lifts of an environment, and f₀ of its normal rows, after a solve of MuJoCo's.
 
-    Clears ``steps.slides`` if all fit. A solve whose error is larger than the least so far only tells the Jacobian; the lifts of the
-    last one are those of the best solve, unless the error fell well.
+    Clears ``steps.slides`` if all fit. Each step is from the best solve so far; one whose error is not less only corrects the Jacobian.
+    The last lifts are those of the best solve, unless the error fell well.
 
     Args:
         velocity: of the rows at the end of the step, by that solve.
@@ -212,8 +218,8 @@ def solve_lifts(
                     slides = wp.int32(1)
                 error += wp.abs(slide.lacks)
                 lifts.slot[i, count] = slot
-                lifts.lift[i, 2, count] = slots.lift[i, pad, body]
-                lifts.lacks[i, 2, count] = slide.lacks
+                lifts.lift[i, 1, count] = slots.lift[i, pad, body]
+                lifts.lacks[i, 1, count] = slide.lacks
                 count += 1
     steps.slides[i] = slides
     steps.solves[i] = solve
@@ -224,38 +230,42 @@ def solve_lifts(
         begin_jacobian(slots, velocity, step, lifts, vary, env, i, count)
     elif wp.isfinite(error):
         for j in range(count):
-            length, change = wp.float64(0.0), lifts.lacks[i, 2, j] - lifts.lacks[i, 1, j]
+            length, change = wp.float64(0.0), lifts.lacks[i, 1, j] - lifts.lacks[i, 0, j]
             for k in range(count):
                 if j == k or shared_compliance(lifts, vary, env, lifts.slot[i, j], lifts.slot[i, k]) != _0:
-                    moved = lifts.lift[i, 2, k] - lifts.lift[i, 1, k]
+                    moved = lifts.lift[i, 1, k] - lifts.lift[i, 0, k]
                     length += moved * moved
                     change -= lifts.jacobian[i, j, k] * moved
             for k in range(count):
                 if length > _0 and (j == k or shared_compliance(lifts, vary, env, lifts.slot[i, j], lifts.slot[i, k]) != _0):
-                    moved = lifts.lift[i, 2, k] - lifts.lift[i, 1, k]
+                    moved = lifts.lift[i, 1, k] - lifts.lift[i, 0, k]
                     lifts.jacobian[i, j, k] = lifts.jacobian[i, j, k] + change / length * moved
     falls = solve == 1 or error < _FALLS * lifts.least[i]
     if solve == 1 or error < lifts.least[i]:
         lifts.least[i] = error
         for j in range(count):
-            lifts.lift[i, 0, j] = lifts.lift[i, 2, j]
-            lifts.lacks[i, 0, j] = lifts.lacks[i, 2, j]
+            lifts.lift[i, 0, j] = lifts.lift[i, 1, j]
+            lifts.lacks[i, 0, j] = lifts.lacks[i, 1, j]
     goes_on = falls or solve < lifts.solves
     for j in range(count):
         lifts.work[i, j, count] = -lifts.lacks[i, 0, j]
         for k in range(count):
             lifts.work[i, j, k] = lifts.jacobian[i, j, k]
     sound = eliminate(lifts.work, i, count, 1)
+    # A step that is too long is shortened as a whole: where one body slides on several pads, lifts fit only along a narrow valley.
+    whole = wp.float64(_1)
+    for j in range(count):
+        if not (sound and wp.isfinite(lifts.work[i, j, count])):
+            sound = wp.bool(False)
+    for j in range(count):
+        if not sound:
+            lifts.work[i, j, count] = lifts.reach[i, j] * lifts.lacks[i, 0, j]
+        farthest = _FARTHEST * lifts.reach[i, j] * lifts.least[i]
+        whole = wp.min(whole, farthest / wp.max(wp.abs(lifts.work[i, j, count]), wp.float64(1e-30)))
     for j in range(count):
         slot = lifts.slot[i, j]
-        best, more = lifts.lift[i, 0, j], lifts.reach[i, j] * lifts.lacks[i, 0, j]
-        if sound and wp.isfinite(lifts.work[i, j, count]):
-            more = lifts.work[i, j, count]
-        farthest = _FARTHEST * lifts.reach[i, j] * lifts.least[i]
-        lift = wp.where(goes_on, wp.max(best + wp.clamp(more, -farthest, farthest), _0), best + _0)
-        before = lifts.lift[i, 2, j]
-        last = wp.where(wp.isfinite(error), 2, 0)
-        lifts.lift[i, 1, j] = lifts.lift[i, last, j]
-        lifts.lacks[i, 1, j] = lifts.lacks[i, last, j]
+        lift = lifts.lift[i, 0, j] + wp.where(goes_on, whole, _0) * lifts.work[i, j, count]
+        lift = wp.max(lift, _0)
+        more = lift - lifts.lift[i, 1, j]
         slots.lift[i, slot[0], slot[1]] = lift
-        slots.force[i, slot[0], slot[1], 0] = slots.force[i, slot[0], slot[1], 0] - (lift - before)
+        slots.force[i, slot[0], slot[1], 0] = slots.force[i, slot[0], slot[1], 0] - more

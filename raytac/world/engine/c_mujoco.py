@@ -253,7 +253,7 @@ class CMujoco:
         warnings.warn(f"environment {env} failed: {rule}", RuntimeWarning, stacklevel=2)
 
 
-_SOLVES = 8
+_SOLVES = 20
 """Solves of MuJoCo's at most for the lift of a slide that begins or ends."""
 
 
