@@ -22,6 +22,7 @@ class ImplicitDamping:
         matters: whether there is damping that a step of the model's timestep does not resolve. If not, steps are MuJoCo's own.
         share: of a joint's acceleration, in which MuJoCo's forces give it at rest, that comes within a step of the model's timestep:
             M / (M + Δt D) on the diagonal, (nv,); 1 where damping does not matter.
+        body_share: the least of those of the degrees of freedom that move a body, (nbody,).
         geoms: True for geoms that a joint moves whose damping matters, (ngeom + 1,); the last one, of no geom, is False.
     """
 
@@ -41,8 +42,10 @@ class ImplicitDamping:
         self.matters = bool((step * damping > _MATTERS * mass).any())
         self.share = mass / (mass + step * damping) if self.matters else np.ones(model.nv)
         slowed = self.share < 1.0 / (1.0 + _MATTERS)
-        chains = [_degrees_of_freedom(model, body) for body in model.geom_bodyid.tolist()]
-        self.geoms = np.array([*(bool(slowed[chain].any()) for chain in chains), False])
+        bodies = [_degrees_of_freedom(model, body) for body in range(model.nbody)]
+        self.body_share = np.array([self.share[chain].min(initial=1.0) for chain in bodies])
+        moved_slowly = np.array([bool(slowed[chain].any()) for chain in bodies])
+        self.geoms = np.append(moved_slowly[model.geom_bodyid], False)
 
     def clear(self) -> None:
         """Forget environments that were not stepped."""

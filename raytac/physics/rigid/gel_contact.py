@@ -11,6 +11,7 @@ import warp as wp
 
 from raytac.errors import InputError
 from raytac.physics.rigid import world_kernels as world
+from raytac.physics.rigid.lift_kernels import TOGETHER, Lifts
 from raytac.physics.rigid.load_law import shear_modulus
 from raytac.physics.rigid.motion_kernels import Frames, move_bodies, pair_of_gels
 from raytac.physics.rigid.pierced import BondedFaces
@@ -60,6 +61,7 @@ class GelContact:
         search: for contacts of bodies.
         frames: frames, velocities and free accelerations of n environments, which ``begin`` reads.
         motion, steps, slots: motion, environments and contacts of the step.
+        lifts: inputs of ``solve_lifts`` after ``velocity``.
         force, velocity: of the rows at the end of the step, (B, pads, bodies + pads, ROWS), which ``end`` reads.
         before: ``pad_from_body`` (B, pads, bodies) at the last step, which ``move`` renews; NaN where unknown.
         wrenches: on the pads (B, pads).
@@ -115,6 +117,14 @@ class GelContact:
         self._struct(self.slots, (*slots, world.ROWS - 1), {"friction": wp.float64})
         self._struct(self.slots, (*slots, world.ROWS), {"force": wp.float64, "regularisation": wp.float64})
         self.steps = self._struct(world.Steps(), (num_envs,), _STEPS)
+        together = min(pads * (count + pads), TOGETHER)
+        lifts = self._struct(Lifts(), (num_envs, together), {"slot": wp.vec2i, "reach": wp.float64})
+        self._struct(lifts, (num_envs, 2, together), {"lift": wp.float64, "lacks": wp.float64})
+        lifts.carrier = self._gels.carrier
+        lifts.least = self._zeros((num_envs,), wp.float64)
+        lifts.jacobian = self._zeros((num_envs, together, together), wp.float64)
+        lifts.work = self._zeros((num_envs, together, 2 * together), wp.float64)
+        self.lifts: list[Any] = [lifts, self.numbers]
         self.force, self.velocity = (self._zeros((*slots, world.ROWS), wp.float64) for _ in range(2))
         self.acceleration, self.rolling = self._zeros(slots, wp.float64), self._zeros(slots, wp.vec2d)
         self.wrenches = self._zeros(all_pads, wp.spatial_vectord)
@@ -131,6 +141,18 @@ class GelContact:
         self._searches = [*([(self.search, 0, 0)] if self.search.pairs else []), *self._pairs]
         for search, _, _ in self._searches:
             search.reserve(search.pairs)
+
+    def expect_lifts(self, solves: int, share: np.ndarray, inverse_weight: np.ndarray) -> None:
+        """Name the most solves for ``lifts``; see ``Lifts``.
+
+        Args:
+            share: of bodies of the model, (nbody,).
+            inverse_weight: ``body_invweight0`` (nbody, 2).
+        """
+        lifts, touched, turning = self.lifts[0], self.numbers.carrier.numpy()[: self._touched.bodies], np.zeros(len(share))
+        turning[touched] = inverse_weight[touched, 1] / np.maximum(inverse_weight[touched, 0], np.finfo(float).tiny)
+        lifts.solves, lifts.share = solves, _array(share, wp.float64, self.device)
+        lifts.turning = _array(turning, wp.float64, self.device)
 
     def begin(self, *, whole: bool = False) -> None:
         """Find contacts from ``frames``, choose steps (unless ``whole``), and set the rows."""
@@ -291,7 +313,7 @@ def _array(values: Any, dtype: Any, device: Any) -> wp.array:
 
 
 _FRAMES: dict[str, Any] = dict.fromkeys(("place", "velocity", "spin", "push", "swing"), wp.vec3d) | {"turn": wp.mat33d}
-_STEPS: dict[str, Any] = dict.fromkeys(("envs", "done", "most", "ticks", "lost", "contacts", "slides"), wp.int32) | {
+_STEPS: dict[str, Any] = dict.fromkeys(("envs", "done", "most", "ticks", "lost", "contacts", "slides", "solves"), wp.int32) | {
     "length": wp.float64
 }
 _MOTION: dict[str, Any] = {"pose": wp.mat44d, "velocity": wp.vec3d, "spin": wp.vec3d, "push": wp.float64}
@@ -307,9 +329,8 @@ _SLOTS: dict[str, Any] = {
     "place": wp.vec3d,
     "frame": wp.mat33d,
     "bend": wp.vec2d,
+    "arm": wp.vec3d,
     "lift": wp.float64,
-    "compliance": wp.float64,
-    "tried": wp.vec2d,
     "wrench": wp.spatial_vectord,
     "opposite": wp.spatial_vectord,
 }

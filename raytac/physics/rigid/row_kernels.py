@@ -12,7 +12,7 @@ end of the step. So every row is a given force and a viscous one at the end of t
 | rolling | −b | N m Δt, m the metacentric height |
 
 The convex cone lifts what slips, which the normal row's f₀ is less by: at the speed at the start of the step, unless a slide begins or
-ends in it. ``Steps.slides`` says where that may be, and MuJoCo's own solution for the end of the step decides then (``correct_lifts``).
+ends in it. ``Steps.slides`` says where that may be, and MuJoCo's own solution for the end of the step decides then (``lift_kernels``).
 
 The last row replaces what a single contact point lacks. A flat face that tilts moves the centre of pressure by its spread m per radian,
 so the normal load turns it back with the stiffness N m, taken at the start of a step. That is stable with as much at its end, which the
@@ -71,7 +71,6 @@ _ROOM = wp.constant(wp.float64(4.0))
 """Cone's bound of rolling over that of friction, to cost sliding at most 3 %."""
 _CHANGE = wp.constant(wp.float64(0.01))
 """Change of a lift over the normal force from which a slide begins or ends."""
-_NAN = wp.constant(wp.float64(float("nan")))
 _ROWS = wp.constant(wp.int32(ROWS))
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
@@ -176,7 +175,8 @@ def set_rows(
 
     # A body that turns about its centre of mass moves the centre of pressure by the spread of the overlap per radian, less the height of
     # that centre over the gel: by nothing at all for a ball. Its principal tangents are those of the rows.
-    height = wp.dot(turn_of(pose) * touched.mass_centre[body] + place_of(pose) - centre, normal)
+    arm = centre - turn_of(pose) * touched.mass_centre[body] - place_of(pose)
+    height = -wp.dot(arm, normal)
     angle = _HALF * wp.atan2(_2 * spread[1], spread[0] - spread[2])
     mean, half = _HALF * (spread[0] + spread[2]), wp.length(wp.vec2d(_HALF * (spread[0] - spread[2]), spread[1]))
     cos, sin = wp.cos(angle), wp.sin(angle)
@@ -233,9 +233,8 @@ def set_rows(
             spreads[k], _LEAST
         )
         k += 1
+    slots.arm[i, pad, body] = rotation * arm
     slots.lift[i, pad, body] = lift
-    slots.compliance[i, pad, body] = compliance
-    slots.tried[i, pad, body] = wp.vec2d(_NAN, _NAN)
     slots.force[i, pad, body, 0] = spring.force - lift
     slots.force[i, pad, body, 1] = -(cos * pull[0] + sin * pull[1])
     slots.force[i, pad, body, 2] = sin * pull[0] - cos * pull[1]

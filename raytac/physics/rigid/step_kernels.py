@@ -170,6 +170,7 @@ def choose_steps(motion: Motion, slots: Slots, timestep: wp.float64, scene_ticks
     steps.length[i] = timestep * wp.float64(ticks) / wp.float64(scene_ticks)
     steps.contacts[i] = 0
     steps.slides[i] = 0
+    steps.solves[i] = 0
 
 
 @wp.kernel

@@ -130,12 +130,10 @@ class Slots:
     """R, (…, ROWS)."""
     bend: wp.array3d(dtype=wp.vec2d)
     """Share of the torque of rolling that builds up per angle about each tangent [1/rad]."""
+    arm: wp.array3d(dtype=wp.vec3d)
+    """From the body's centre of mass to the contact, world frame."""
     lift: wp.array3d(dtype=wp.float64)
     """Normal force that MuJoCo's cone adds, which f₀ is without [N]."""
-    compliance: wp.array3d(dtype=wp.float64)
-    """1/m of both bodies [1/kg]."""
-    tried: wp.array3d(dtype=wp.vec2d)
-    """Lift that was tried before, and by how much it was too small [N]; NaN at first."""
     wrench: wp.array3d(dtype=wp.spatial_vectord)
     """Force and torque on the pad, about its origin."""
     opposite: wp.array3d(dtype=wp.spatial_vectord)
@@ -162,6 +160,8 @@ class Steps:
     """Contacts of gels that are held."""
     slides: wp.array(dtype=wp.int32)
     """1 where a contact may begin or end to slide, so that its lift is not known yet."""
+    solves: wp.array(dtype=wp.int32)
+    """Solves of MuJoCo's for lifts so far."""
 
 
 @wp.struct

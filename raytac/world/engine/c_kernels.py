@@ -12,18 +12,10 @@ from __future__ import annotations
 
 import warp as wp
 
+from raytac.physics.rigid.lift_kernels import LEAST_FRICTION, Lifts, solve_lifts
 from raytac.physics.rigid.motion_kernels import Frames
-from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
-from raytac.world.engine.shared_kernels import (
-    LEAST_FRICTION,
-    closing,
-    correct_lift,
-    is_among,
-    is_box,
-    is_open,
-    passes,
-    slide_force,
-)
+from raytac.physics.rigid.world_kernels import ROWS, Differences, Slots, Steps
+from raytac.world.engine.gap_kernels import closing, is_among, is_box, is_open, passes
 from raytac.world.world_state import LARGEST_SPEED
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -262,6 +254,23 @@ def row_times(memory: Memory, env: wp.int32, row: wp.int32, values: wp.array(dty
     return result
 
 
+@wp.func
+def write_gel_references(memory: Memory, steps: Steps, slots: Slots, i: wp.int32):
+    """Set reference accelerations of the last rows."""
+    env, step = steps.envs[i], steps.length[i]
+    velocity, reference = doubles(memory, env, memory.efc_vel), doubles(memory, env, memory.efc_aref)
+    row = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
+    for pad in range(slots.held.shape[1]):
+        for body in range(slots.held.shape[2]):
+            if slots.held[i, pad, body] != 0:
+                m = wp.int32(0)
+                while m < _ROWS:
+                    wanted = slots.force[i, pad, body, m] * slots.regularisation[i, pad, body, m]
+                    reference[row] = wanted - velocity[row] / step
+                    row += 1
+                    m += 1
+
+
 @wp.kernel
 def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(dtype=wp.int32), boxes: wp.array(dtype=wp.vec3d)):
     """Set reference accelerations of the last rows and ``hard`` geoms, after MuJoCo's own.
@@ -305,53 +314,39 @@ def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(
                 contact[n + memory.mu] *= _SLIPPERY
                 for m in range(_ROWS - 1):
                     contact[n + memory.friction + m] *= _SLIPPERY
-    row = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
-    for pad in range(slots.held.shape[1]):
-        for body in range(slots.held.shape[2]):
-            if slots.held[i, pad, body] != 0:
-                m = wp.int32(0)
-                while m < _ROWS:
-                    wanted = slots.force[i, pad, body, m] * slots.regularisation[i, pad, body, m]
-                    reference[row] = wanted - velocity[row] / step
-                    row += 1
-                    m += 1
+    write_gel_references(memory, steps, slots, i)
 
 
 @wp.kernel
-def correct_lifts(memory: Memory, steps: Steps, slots: Slots):
-    """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step.
-
-    ``steps.slides`` stays 1 until all fit.
-    """
+def correct_lifts(
+    memory: Memory, steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, vary: Differences
+):
+    """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step; see ``solve_lifts``."""
     i = wp.tid()
     if steps.slides[i] == 0 or steps.lost[i] != 0:
         return
     env, step = steps.envs[i], steps.length[i]
     before = doubles(memory, env, memory.efc_vel)
-    reference = doubles(memory, env, memory.efc_aref)
     acceleration = doubles(memory, env, memory.qacc)
-    # The next solve, which differs by a lift, begins with this solution.
-    guess = doubles(memory, env, memory.qacc_warmstart)
-    for k in range(memory.nv):
-        guess[k] = acceleration[k]
-    row = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
-    slides = wp.int32(0)
+    first = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
+    row, sound = wp.int32(first), wp.bool(True)
     for pad in range(slots.held.shape[1]):
         for body in range(slots.held.shape[2]):
             if slots.held[i, pad, body] != 0:
-                ahead, total = before[row] + step * row_times(memory, env, row, acceleration), wp.float64(0.0)
-                m = wp.int32(1)
+                m = wp.int32(0)
                 while m < _ROWS:
-                    slide = before[row + m] + step * row_times(memory, env, row + m, acceleration)
-                    force = slide_force(slots, i, pad, body, m, slide, step)
-                    total += force * force
+                    ahead = before[row] + step * row_times(memory, env, row, acceleration)
+                    velocity[i, pad, body, m] = ahead
+                    sound = sound and wp.isfinite(ahead)
+                    row += 1
                     m += 1
-                lacks, less = correct_lift(slots, i, pad, body, ahead, wp.sqrt(total), step)
-                if lacks:
-                    slides = 1
-                    reference[row] = reference[row] - less
-                row += _ROWS
-    steps.slides[i] = slides
+    if sound:
+        # The next solve, which differs by lifts, begins with this solution.
+        guess = doubles(memory, env, memory.qacc_warmstart)
+        for k in range(memory.nv):
+            guess[k] = acceleration[k]
+    solve_lifts(steps, slots, velocity, lifts, vary, i)
+    write_gel_references(memory, steps, slots, i)
 
 
 @wp.kernel

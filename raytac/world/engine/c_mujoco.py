@@ -92,6 +92,7 @@ class CMujoco:
         indices = [_array(values) for values in (pads.sites, bodies, roots, last, model.dof_parentid)]
         gels, others = _array(pads.geoms[len(pads.bodies) :]), _array(pads.geoms)
         launch = partial(wp.launch, device="cpu")
+        contact.expect_lifts(_SOLVES, self._damping.body_share, model.body_invweight0)
         frames = [memory, steps, *indices, wp.array(self._damping.share, dtype=wp.float64, device="cpu"), contact.frames]
         forces = [memory, slots, steps, contact.force, contact.velocity]
         self.read_frames = partial(launch, read_frames, dim=(num_envs, len(bodies)), inputs=frames)
@@ -102,7 +103,7 @@ class CMujoco:
                 (write_contacts, [gels, others]),
                 (write_regularisation, []),
                 (write_references, [_array(pads.hard), wp.array(box_sizes(model), dtype=wp.vec3d, device="cpu")]),
-                (correct_lifts, []),
+                (correct_lifts, [contact.velocity, *contact.lifts]),
             )
         )
         self.bind(datas)
@@ -252,7 +253,7 @@ class CMujoco:
         warnings.warn(f"environment {env} failed: {rule}", RuntimeWarning, stacklevel=2)
 
 
-_SOLVES = 5
+_SOLVES = 20
 """Solves of MuJoCo's at most for the lift of a slide that begins or ends."""
 
 

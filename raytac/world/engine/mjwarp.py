@@ -98,6 +98,7 @@ class MujocoWarp:
         self._rows = 4 * self._contacts if rows is None else rows
         damping = ImplicitDamping(model)
         self._damped, self._always = damping.matters, int(pads.hard.any())
+        self._contact.expect_lifts(_SLIDES, damping.body_share, model.body_invweight0)
         with wp.ScopedDevice(self.device):
             sizes = {name: num_envs for name in _VARIED if getattr(model, name).size}
             try:
@@ -113,7 +114,7 @@ class MujocoWarp:
             self._own: Any = kernels.Own()
             self.active, self._done = wp.full(num_envs, value=True, dtype=wp.bool), wp.zeros(num_envs, dtype=wp.int32)
             self.elapsed = wp.zeros(num_envs, dtype=wp.float64)
-            self._own.first, self._own.sliding = wp.zeros(1, dtype=wp.int32), wp.zeros(num_envs, dtype=wp.int32)
+            self._own.first = wp.zeros(1, dtype=wp.int32)
             self._own.contact, self._own.scale = wp.full(shape, -1, dtype=wp.int32), wp.zeros(shape, dtype=wp.float64)
             self._saved: Any = kernels.Saved()
             for name in ("time", "qpos", "qvel", "act"):
@@ -218,8 +219,8 @@ class MujocoWarp:
             self._launch(kernels.write_rows, own.contact.shape, [worlds, steps, slots, own])
             for _ in range(_SLIDES):
                 mjw.solve(self.model, self.data)
-                self._launch(kernels.begin_correction, self.num_envs, [worlds, steps, own])
-                self._launch(kernels.correct_lifts, own.contact.shape, [worlds, own, steps, slots])
+                lifts = [self._contact.velocity, *self._contact.lifts]
+                self._launch(kernels.correct_lifts, self.num_envs, [worlds, own, steps, slots, *lifts])
 
     def _add_damping(self) -> None:
         model, data, steps = self.model, self.data, self._contact.steps

@@ -15,18 +15,10 @@ from __future__ import annotations
 
 import warp as wp
 
+from raytac.physics.rigid.lift_kernels import LEAST_FRICTION, Lifts, solve_lifts
 from raytac.physics.rigid.motion_kernels import Frames
-from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
-from raytac.world.engine.shared_kernels import (
-    LEAST_FRICTION,
-    closing,
-    correct_lift,
-    is_among,
-    is_box,
-    is_open,
-    passes,
-    slide_force,
-)
+from raytac.physics.rigid.world_kernels import ROWS, Differences, Slots, Steps
+from raytac.world.engine.gap_kernels import closing, is_among, is_box, is_open, passes
 from raytac.world.world_state import LARGEST_SPEED
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -118,8 +110,6 @@ class Own:
     """Index; −1 without a contact."""
     scale: wp.array3d(dtype=wp.float64)
     """t."""
-    sliding: wp.array(dtype=wp.int32)
-    """``Steps.slides`` before the last correction, (B,)."""
 
 
 @wp.struct
@@ -405,39 +395,39 @@ def write_hard_references(
 
 
 @wp.kernel
-def begin_correction(worlds: Worlds, steps: Steps, own: Own):
-    """Note where slides are unknown; the next solve, with another lift, begins with this one."""
+def correct_lifts(
+    worlds: Worlds, own: Own, steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, vary: Differences,
+):  # fmt: skip
+    """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step; see ``solve_lifts``."""
     i = wp.tid()
-    own.sliding[i] = steps.slides[i]
-    steps.slides[i] = 0
+    sound = wp.bool(True)
     for k in range(worlds.nv):
-        worlds.qacc_warmstart[i, k] = worlds.qacc[i, k]
-
-
-@wp.kernel
-def correct_lifts(worlds: Worlds, own: Own, steps: Steps, slots: Slots):
-    """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step.
-
-    ``steps.slides`` stays 1 until all fit.
-    """
-    i, pad, body = wp.tid()
-    k = own.contact[i, pad, body]
-    if k < 0 or own.sliding[i] == 0 or steps.lost[i] != 0:
+        sound = sound and wp.isfinite(worlds.qacc[i, k])
+    if sound:
+        # The next solve, which may differ by lifts, begins with this solution.
+        for k in range(worlds.nv):
+            worlds.qacc_warmstart[i, k] = worlds.qacc[i, k]
+    if steps.slides[i] == 0 or steps.lost[i] != 0:
         return
-    row = worlds.efc_address[k, 0]
-    if row < 0 or worlds.efc_address[k, _ROWS - 1] < 0:
-        return
-    step, t, total = steps.length[i], own.scale[i, pad, body], wp.float64(0.0)
-    ahead = wp.float64(worlds.vel[i, row]) + step * row_times(worlds, i, row, worlds.qacc)
-    for m in range(1, _ROWS):
-        other, factor = worlds.efc_address[k, m] + 0, wp.where(is_scaled(m), t, _1)
-        slide = (wp.float64(worlds.vel[i, other]) + step * row_times(worlds, i, other, worlds.qacc)) / factor
-        force = slide_force(slots, i, pad, body, m, slide, step)
-        total += force * force
-    lacks, less = correct_lift(slots, i, pad, body, ahead, wp.sqrt(total), step)
-    if lacks:
-        wp.atomic_max(steps.slides, i, 1)
-        worlds.aref[i, row] = wp.float32(wp.float64(worlds.aref[i, row]) - less)
+    step = steps.length[i]
+    for pad in range(slots.held.shape[1]):
+        for body in range(slots.held.shape[2]):
+            k = own.contact[i, pad, body]
+            if k >= 0:
+                for m in range(_ROWS):
+                    row = worlds.efc_address[k, m] + 0
+                    if row < 0:
+                        return
+                    ahead = wp.float64(worlds.vel[i, row]) + step * row_times(worlds, i, row, worlds.qacc)
+                    velocity[i, pad, body, m] = ahead / wp.where(is_scaled(m), own.scale[i, pad, body], _1)
+    solve_lifts(steps, slots, velocity, lifts, vary, i)
+    for pad in range(slots.held.shape[1]):
+        for body in range(slots.held.shape[2]):
+            k = own.contact[i, pad, body]
+            if k >= 0:
+                row = worlds.efc_address[k, 0]
+                wanted = slots.force[i, pad, body, 0] * slots.regularisation[i, pad, body, 0]
+                worlds.aref[i, row] = wp.float32(wanted - wp.float64(worlds.vel[i, row]) / step)
 
 
 @wp.kernel

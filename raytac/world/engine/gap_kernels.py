@@ -1,9 +1,4 @@
-"""Functions of the kernels of both engines.
-
-They are for gaps between hard geoms, and for lifts of slides that begin or end.
-
-Gaps are in the precision of the engine.
-"""
+"""Gaps between hard geoms, in the kernels of both engines and the precision of each."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -16,14 +11,8 @@ from typing import Any
 
 import warp as wp
 
-from raytac.physics.rigid.world_kernels import Slots
-
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
-LEAST_FRICTION = wp.constant(wp.float64(1e-6))
-"""Least coefficient of friction, which MuJoCo wants positive."""
-_FITS = wp.constant(wp.float64(0.005))
-"""Error of a lift over the normal force that is left."""
 _BACK = wp.constant(wp.float64(0.1))
 """Share of a penetration that a step takes back."""
 _BESIDE = wp.constant(wp.float64(1e-4))
@@ -34,7 +23,6 @@ _FAR = wp.constant(wp.float64(1.0))
 """Gap that no step closes [m]."""
 _HALF = wp.constant(wp.float64(0.5))
 _0 = wp.constant(wp.float64(0.0))
-_1 = wp.constant(wp.float64(1.0))
 
 
 @wp.func
@@ -97,46 +85,3 @@ def closing(gap: Any, passed: wp.bool):
     if passed:
         return type(gap)(_FAR)
     return wp.where(gap > type(gap)(_0), gap, type(gap)(_BACK) * gap)
-
-
-@wp.func
-def slide_force(
-    slots: Slots, i: wp.int32, pad: wp.int32, body: wp.int32, m: wp.int32, ahead: wp.float64, step: wp.float64
-) -> wp.float64:
-    """Force [N] of row m of a contact, if it sticks, by the friction of row 1 over its own.
-
-    ``ahead``: velocity of the row at the end of the step.
-    """
-    force = slots.force[i, pad, body, m] - ahead / (slots.regularisation[i, pad, body, m] * step)
-    friction = wp.max(slots.friction[i, pad, body, 0], LEAST_FRICTION)
-    return force * (friction / wp.max(slots.friction[i, pad, body, m - 1], LEAST_FRICTION))
-
-
-@wp.func
-def correct_lift(
-    slots: Slots, i: wp.int32, pad: wp.int32, body: wp.int32, ahead: wp.float64, slide: wp.float64, step: wp.float64
-):
-    """Set the lift of one contact.
-
-    Returns whether it did not fit, and by how much the reference of its normal row falls.
-
-    A slide that is faster by a lift that is larger asks for more: the first guess follows from the contact's own mass, the others by
-    secants. ``ahead``: velocity of the normal row at the end of the step; ``slide``: root of the sum of squares of all ``slide_force``.
-    """
-    lift = slots.lift[i, pad, body]
-    regular, sheared = slots.regularisation[i, pad, body, 0], slots.regularisation[i, pad, body, 1]
-    friction, ratio = wp.max(slots.friction[i, pad, body, 0], LEAST_FRICTION), sheared / regular
-    normal = wp.max(slots.force[i, pad, body, 0] + lift - ahead / (regular * step), _0)
-    lacks = friction * ratio * wp.max(slide - friction * normal, _0) - lift
-    if wp.abs(lacks) <= _FITS * normal:
-        return False, _0
-    tried = slots.tried[i, pad, body]
-    square = friction * friction * ratio
-    more = lacks * (_1 + square * slots.compliance[i, pad, body] / sheared / (_1 + square))
-    if not wp.isnan(tried[0]) and tried[1] != lacks:
-        more = lacks * (lift - tried[0]) / (tried[1] - lacks)
-    more = wp.max(more, -lift)
-    slots.tried[i, pad, body] = wp.vec2d(lift, lacks)
-    slots.lift[i, pad, body] = lift + more
-    slots.force[i, pad, body, 0] = slots.force[i, pad, body, 0] - more
-    return True, more * regular
