@@ -27,7 +27,10 @@ from raytac.physics.rigid.world_kernels import ROWS, Differences, Slots, Steps
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 TOGETHER = 16
-"""Most contacts of an environment whose lifts are corrected; others keep that of the start of the step."""
+"""Most contacts of an environment whose lifts are corrected.
+
+Others keep that of the start of the step.
+"""
 
 _FITS = wp.constant(wp.float64(0.005))
 """Error of a lift over the normal force that is left."""
@@ -53,7 +56,10 @@ class Lifts:
     carrier: wp.array(dtype=wp.int32)
     """Body of the model that carries each pad, (pads,)."""
     share: wp.array(dtype=wp.float64)
-    """Of the acceleration of each body of the model that comes, as damping is implicit (``ImplicitDamping``)."""
+    """Share of the acceleration of each body that comes.
+
+    It is less than 1 as damping is implicit (``ImplicitDamping``).
+    """
     turning: wp.array(dtype=wp.float64)
     """Mass over inertia of the bodies of the model that pads touch [1/m²], of others 0."""
     slot: wp.array2d(dtype=wp.vec2i)
@@ -114,7 +120,10 @@ def slide_of(slots: Slots, velocity: wp.array4d(dtype=wp.float64), step: wp.floa
 
 @wp.func
 def shared_compliance(lifts: Lifts, vary: Differences, env: wp.int32, one: wp.vec2i, two: wp.vec2i) -> wp.float64:
-    """1/m [1/kg] by which a force at a contact changes the speed at another; negative where it is on one's body and two's pad."""
+    """1/m [1/kg] by which a force at a contact changes the speed at another.
+
+    It is negative where it is on one's body and two's pad.
+    """
     result = wp.float64(0.0)
     for m in range(2):
         for n in range(2):
@@ -147,7 +156,10 @@ def change_of_speed(
 
 @wp.func
 def eliminate(work: wp.array3d(dtype=wp.float64), i: wp.int32, count: wp.int32, columns: wp.int32) -> wp.bool:
-    """Solve for the ``columns`` after the first ``count`` in place, by Gauss and Jordan; False if singular."""
+    """Solve for the ``columns`` after the first ``count`` in place; False if singular.
+
+    The method is that of Gauss and Jordan.
+    """
     for k in range(count):
         pivot = wp.int32(k)
         for j in range(k + 1, count):

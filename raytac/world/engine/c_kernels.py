@@ -321,7 +321,10 @@ def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(
 def correct_lifts(
     memory: Memory, steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, vary: Differences
 ):
-    """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step; see ``solve_lifts``."""
+    """Set the lifts of slides that begin or end; see ``solve_lifts``.
+
+    They follow from MuJoCo's speeds for the end of the step.
+    """
     i = wp.tid()
     if steps.slides[i] == 0 or steps.lost[i] != 0:
         return

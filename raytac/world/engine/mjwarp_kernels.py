@@ -398,7 +398,10 @@ def write_hard_references(
 def correct_lifts(
     worlds: Worlds, own: Own, steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, vary: Differences,
 ):  # fmt: skip
-    """Set the lifts of slides that begin or end by MuJoCo's speeds for the end of the step; see ``solve_lifts``."""
+    """Set the lifts of slides that begin or end; see ``solve_lifts``.
+
+    They follow from MuJoCo's speeds for the end of the step.
+    """
     i = wp.tid()
     sound = wp.bool(True)
     for k in range(worlds.nv):
