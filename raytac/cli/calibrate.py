@@ -54,10 +54,10 @@ class CalibrateArgs(FitOptions, SolverOptions):
     def run(self) -> int:
         start = time.perf_counter()
         self._refuse_options_of_the_other()
+        self.prepare_solver()
         if self.what != "markers":
             return self._optics(start)
         sensor = load_sensor(self.sensor)
-        self.prepare_solver()
         out = self.folder("calibrate", "markers", sensor.name + ("-quick" if self.quick else ""))
         try:
             written = run_calibrate_markers(

@@ -122,13 +122,13 @@ def chosen_physics(physics: str | None, level: str | None, scene: PressScene | T
 
 @dataclass(frozen=True, kw_only=True)
 class SolverOptions(CommonOptions):
-    """Options of a command that may use the contact solver."""
+    """Options of a command that computes contacts."""
 
     verbose: bool = False
-    """Let Warp, on which the contact solver runs, list devices and the kernels that it loads."""
+    """Let Warp, in which contacts are computed, list devices and the kernels that it loads."""
 
     def prepare_solver(self) -> None:
-        """Call before the solver is first used."""
+        """Call before contacts are first computed."""
         if not self.verbose:
             quiet_solver()
 

@@ -82,7 +82,7 @@ class ViewArgs(ShadowOptions):
         OPTICS.config(self.optics, **self.chosen_shadows())
         scene = load_scene(self.scene)
         physics = chosen_physics(self.physics, self.level, scene)
-        if physics.is_simulated and not self.verbose:
+        if not self.verbose:
             quiet_solver()
         session = self._press(scene, physics) if isinstance(scene, PressScene) else self._task(scene, physics)
         with Viewer(session, host=self.host, port=self.port, allow_hosts=allowed) as viewer:

@@ -111,10 +111,11 @@ def test_the_grip_closes_evenly_and_holds_the_peg_against_gravity(modules: dict[
         if phases.count("lower") == 3:
             break
     left, right = world.wrench("left").force, world.wrench("right").force
-    # Equal and opposite across, and together they carry the peg and the gel, which move evenly.
+    # Equal and opposite across, and together they carry the peg and the gel, which move evenly: to 3 %, since what sticks is so stiff
+    # that the 20 µm at which a step stops are felt.
     np.testing.assert_allclose(left[:, 0], -right[:, 0], rtol=1e-3)
     assert (right[:, 0] > 1.0).all()
-    np.testing.assert_allclose((left + right)[:, 2], -weight, rtol=0.01)
+    np.testing.assert_allclose((left + right)[:, 2], -weight, rtol=0.03)
     A, p = world.affine_pose("peg")
     slip = p[:, 2] - world.frame("left")[1][:, 2]
     assert (np.abs(slip) < 20e-6).all() and (np.abs(p[:, :2]) < 1e-6).all()

@@ -1,4 +1,4 @@
-"""Messages of Warp, on which the contact solver runs."""
+"""Messages of Warp, in which contacts are computed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def quiet_solver() -> None:
     """Let Warp print only warnings and errors in this process.
 
     Warp otherwise lists devices and every module that it loads. The level belongs to the process, so ``ipc`` and ``TactileSensor`` leave it
-    alone: this is for programs, such as the ``raytac`` command. Call it before the solver is first used. Nothing happens without
+    alone: this is for programs, such as the ``raytac`` command. Call it before contacts are first computed. Nothing happens without
     raytac's own ``ipc``.
     """
     if foreign_ipc() is not None:

@@ -88,8 +88,3 @@ class CompareSettings:
         missing = [name for name in ("jinja2", "pyarrow", "skimage") if importlib.util.find_spec(name) is None]
         if missing:
             raise BackendError(f"the report needs {', '.join(missing)}: `pip install 'raytac[report]'`")
-
-    @property
-    def uses_solver(self) -> bool:
-        """True if anything is pressed into the soft pad."""
-        return self.markers or self.pad is not None
