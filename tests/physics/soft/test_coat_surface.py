@@ -122,6 +122,7 @@ def test_traction_needs_a_grid_finer_than_the_coat():
         CoatTraction(pad_mesh(GELPAD, "fine").coat, make_grid(GELPAD, 2e-3))
 
 
+@pytest.mark.solver
 def test_foundation_traction_has_the_total_and_the_twist():
     from raytac.gel.pyramid import ElasticSurround
 
