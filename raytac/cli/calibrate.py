@@ -54,7 +54,7 @@ class CalibrateArgs(FitOptions, SolverOptions):
     def run(self) -> int:
         start = time.perf_counter()
         self._refuse_options_of_the_other()
-        self.prepare_solver()
+        self.prepare_warp()
         if self.what != "markers":
             return self._optics(start)
         sensor = load_sensor(self.sensor)

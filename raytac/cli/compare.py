@@ -49,7 +49,7 @@ class CompareArgs(SolverOptions):
         out = self.folder("compare")
         settings = self.settings()
         settings.check()
-        self.prepare_solver()
+        self.prepare_warp()
         try:
             comparison = run_comparison(settings, out)
             written = write_comparison(comparison, out, time.perf_counter() - start)

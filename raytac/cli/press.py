@@ -73,7 +73,7 @@ class PressArgs(ShadowOptions, SolverOptions):
         computed = (*outputs, "layers") if "rgb" in outputs and "layers" in every else outputs
         scene = press_of(self.scene, depth=None if self.depth is None else self.depth / 1e3, scale=self.scale)
         physics = chosen_physics(self.physics, self.level, scene)
-        self.prepare_solver()
+        self.prepare_warp()
         sensor = TactileSensor(
             self.sensor,
             physics=physics,

@@ -127,7 +127,7 @@ class SolverOptions(CommonOptions):
     verbose: bool = False
     """Let Warp, in which contacts are computed, list devices and the kernels that it loads."""
 
-    def prepare_solver(self) -> None:
+    def prepare_warp(self) -> None:
         """Call before contacts are first computed."""
         if not self.verbose:
             quiet_solver()

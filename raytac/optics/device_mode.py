@@ -261,7 +261,7 @@ class DeviceMode(ABC):
         """Launch the images of heights (B, Ny, Nx) safe to trace; returns a function that waits."""
         lit = seen = None
         if self._lit:
-            lit = self.render_device(self._upload(heights), self._upload_contact(surface, failed), self._upload_ink(surface))
+            lit = self.render_device(self._upload(heights), self._upload_contact(surface, failed), self._upload_ink(surface.ink))
         if {"normals", "depth"} & set(self.outputs):
             seen = self._recorded(self._seen, self._upload(heights), None, None)
         return partial(self._images, surface, failed, lit, seen)
@@ -356,9 +356,8 @@ class DeviceMode(ABC):
         touched = surface.contact & ~failed[:, None, None] if failed.any() else surface.contact
         return self.mi.UInt8(np.ascontiguousarray(touched).view(np.uint8).ravel())
 
-    def _upload_ink(self, surface: GelSurface) -> Float | None:
-        ink = checked_ink(surface)
-        return None if ink is None else self._upload(ink)
+    def _upload_ink(self, checked: np.ndarray | None) -> Float | None:
+        return None if checked is None else self._upload(checked)
 
 
 class _Launched:

@@ -18,7 +18,7 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.camera import Pinhole
 from raytac.optics.device_mode import DeviceMode, Float, FrameInputs, UInt8
 from raytac.optics.geometry import CoatLayout, bilinear
-from raytac.optics.ink import darkened, ink_at
+from raytac.optics.ink import checked_ink, darkened, ink_at
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ class ImageMode(DeviceMode):
     def _seen_now(self, surface: GelSurface, *, dotted: bool) -> tuple[ImageHeights, FrameInputs, np.ndarray]:
         """Surface seen by the pixels, without a recording; its inputs; mask of failed environments."""
         heights, failed = self._checked(surface)
-        inputs = replace(self._inputs, ink=self._upload_ink(surface) if dotted else None)
+        inputs = replace(self._inputs, ink=self._upload_ink(checked_ink(surface)) if dotted else None)
         return self._see(self._upload(heights), self._upload_contact(surface, failed), inputs), inputs, failed
 
     def render_levels(self, surface: GelSurface) -> np.ndarray:
