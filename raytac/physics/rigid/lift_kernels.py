@@ -40,6 +40,8 @@ _FARTHEST = wp.constant(wp.float64(2.0))
 """Longest change of a lift, over that of a contact alone with all error of the environment."""
 LEAST_FRICTION = wp.constant(wp.float64(1e-6))
 """Least coefficient of friction, which MuJoCo wants positive."""
+_LEAST_FORCE = wp.constant(wp.float64(1e-6))
+"""Least force [N] that another is divided by."""
 _ROWS = wp.constant(wp.int32(ROWS))
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
@@ -114,7 +116,7 @@ def slide_of(slots: Slots, velocity: wp.array4d(dtype=wp.float64), step: wp.floa
     result.push = frame[0]
     if wanted > _0 or lift > _0:
         result.cone = _1 + friction * friction * ratio
-        result.push += friction / wp.max(size, LEAST_FRICTION) * along
+        result.push += friction / wp.max(size, _LEAST_FORCE) * along
     return result
 
 
