@@ -72,6 +72,7 @@ class World:
             self._newton = Newton(self._potential, self.layout, self.settings)
         self._failed = np.zeros(num_envs, bool)
         self._patches: dict[int, RestPatches] = {}
+        self._dt = np.full(num_envs, self.settings.dt)
         frames = self.layout.frame_pose
         # Targets of the next step. They are copied to the device before a step if they changed.
         self._goal_p = np.zeros((num_envs, len(frames), 3))
@@ -132,18 +133,25 @@ class World:
         v[mask, nodes] = per_env(velocity, (3,), "velocity", self.num_envs)[mask, None]
         self._potential.v.assign(v)
 
-    def step(self, dt: float | None = None) -> StepReport:
-        """Advance every environment that has not failed by ``dt`` [s]; None: by ``settings.dt``.
+    def step(self, dt: ArrayLike | None = None, envs: ArrayLike | None = None) -> StepReport:
+        """Advance environments that have not failed by ``dt`` [s]; None: by ``settings.dt``.
 
-        On CUDA every new ``dt`` costs a recording; take few different ones.
+        Args:
+            dt: length of the step of all environments, or of each (B,); those that are not stepped may have any.
+            envs: a mask (B,) or list of the environments to step; None for all. The others stay as they are, with the forces of their
+                last step; their report says that they converged in no iteration.
 
         Raises ``IpcError`` if ``dt`` is not positive.
         """
-        if dt is not None and not 0.0 < dt < np.inf:
+        chosen = env_mask(envs, self.num_envs)
+        lengths = per_env(self.settings.dt if dt is None else dt, (), "dt", self.num_envs)
+        if not (lengths[chosen] > 0.0).all():
             raise IpcError(f"dt = {dt}: it must be positive")
-        pot, alive = self._potential, ~self._failed
+        pot, alive = self._potential, ~self._failed & chosen
         with LAUNCH:
-            pot.set_dt(dt or self.settings.dt)
+            if not np.array_equal(lengths, self._dt):
+                self._dt = np.array(lengths)
+                pot.dt.assign(self._dt)
             if self._targets_set:
                 pot.goal_p.assign(self._goal_p)
                 pot.goal_q.assign(self._goal_q)
@@ -151,10 +159,10 @@ class World:
             values = self._newton.step(alive)
         self._failed |= values["failed"].astype(bool)
         return StepReport(
-            converged=values["converged"].astype(bool),
+            converged=values["converged"].astype(bool) | (~chosen & ~self._failed),
             failed=self._failed.copy(),
             stalled=values["stalled"].astype(bool),
-            blocked=1.0 - values["progress"],
+            blocked=np.where(chosen | self._failed, 1.0 - values["progress"], 0.0),
             min_gap=values["min_gap"],
             min_det=values["min_det"],
             newton=values["newton"].astype(np.int64),
