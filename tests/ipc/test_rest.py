@@ -83,9 +83,9 @@ def test_what_moves_or_is_bent_is_not_at_rest() -> None:
     world.step()
     position = np.array([0.0, 0.0, 0.1 + 4.1e-3])  # above the pad, then into it and away again
     gap = []
-    world.teleport("ball", position + (0.0, 0.0, 1e-3))
+    world.teleport("ball", position + np.array([0.0, 0.0, 1e-3]))
     for depth in (-0.5e-3, -0.1e-3, 0.3e-3, -0.5e-3, -1e-3, -1e-3):
-        world.set_target("ball", position - (0.0, 0.0, depth))
+        world.set_target("ball", position - np.array([0.0, 0.0, depth]))
         world.step()
         gap.append(world.distance_from_rest()[0])
     assert gap[2] > 1e-4 and max(gap[:2]) < TOLERANCE and gap[-1] < TOLERANCE < gap[3]
@@ -93,7 +93,9 @@ def test_what_moves_or_is_bent_is_not_at_rest() -> None:
 
 def test_a_driven_world_is_never_at_rest() -> None:
     cube = ipc.AffineBody("cube", ipc.icosphere(5e-3, 1), ipc.Stiff(density=1000.0), drive=100.0)
-    world = ipc.World([bonded_pad(small_pad(), pose=ipc.Pose((0.0, 0.0, 0.1))), cube], ipc.Settings(dt=DT, d_hat=1e-4), device="cpu")
+    world = ipc.World(
+        [bonded_pad(small_pad(), pose=ipc.Pose((0.0, 0.0, 0.1))), cube], ipc.Settings(dt=DT, d_hat=1e-4), device="cpu"
+    )
     world.step()
     assert np.isinf(world.distance_from_rest()).all()
     with pytest.raises(ipc.IpcError, match="drive"):

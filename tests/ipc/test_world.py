@@ -168,7 +168,7 @@ def test_environments_take_steps_of_their_own_length_or_none(device: str) -> Non
             assert np.array_equal(batch.positions("pad")[env], single.positions("pad")[0]), k
             assert np.array_equal(batch.contact_forces("pad")[env], single.contact_forces("pad")[0]), k
     assert np.abs(batch.wrench("ball").force[:, 2]).min() > 0.01
-    with pytest.raises(ipc.IpcError, match="dt = .*positive"):
+    with pytest.raises(ipc.IpcError, match=r"dt = .*positive"):
         batch.step([0.01, 0.0, 0.01], [0, 1])
     batch.step([0.01, 0.0, 0.01], [0, 2])
 

@@ -115,7 +115,9 @@ class SoftScene:
         self._start_state = self.world.save()
         self._now = Poses(self._start[0], self._registry.driven(self._start[1])).copy()
         self._substeps = Substeps(self.pads, self.bodies, self, accuracy.substeps)
-        self._sleep = Sleep(self.pads, self.bodies, self._substeps, self.world, self.settings.velocity_tolerance * self.settings.dt)
+        self._sleep = Sleep(
+            self.pads, self.bodies, self._substeps, self.world, self.settings.velocity_tolerance * self.settings.dt
+        )
         self._asleep = np.zeros(self.num_envs, bool)
         self._energies = np.zeros(self.num_envs), np.zeros(self.num_envs)
         self._readers: dict[str, SoftReader] = {}

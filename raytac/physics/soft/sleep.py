@@ -25,7 +25,12 @@ class Sleep:
     """
 
     def __init__(
-        self, pads: Mapping[str, ScenePad], bodies: Mapping[str, SceneBody], substeps: Substeps, world: ipc.World, tolerance: float
+        self,
+        pads: Mapping[str, ScenePad],
+        bodies: Mapping[str, SceneBody],
+        substeps: Substeps,
+        world: ipc.World,
+        tolerance: float,
     ) -> None:
         """``tolerance``: largest displacement of a node from its place at rest [m]."""
         self._substeps, self._world, self._tolerance = substeps, world, tolerance

@@ -57,9 +57,7 @@ class Substeps:
                 pair = (b.name, a.name) if isinstance(a.solid, ipc.HalfSpace) else (a.name, b.name)
                 (self.pairs if a.is_soft or b.is_soft else self.rigid_pairs).append(pair)
 
-    def next_part(
-        self, done: np.ndarray, now: Poses, goal: Poses, dt: np.ndarray
-    ) -> tuple[np.ndarray, dict[int, Pair | None]]:
+    def next_part(self, done: np.ndarray, now: Poses, goal: Poses, dt: np.ndarray) -> tuple[np.ndarray, dict[int, Pair | None]]:
         """Parts (B,) of a step of ``dt`` (B,) [s] that may be made next, and the environments to refuse.
 
         These with the pair that moves too far. Parts are counted in ``limits.most``-ths of the step, as is ``done`` (B,). They are powers
@@ -68,7 +66,9 @@ class Substeps:
         """
         most, waits = self.limits.most, (done < self.limits.most) & ~self._query.failed
         motions = self.motions(now, goal, dt * (1.0 - done / most))
-        driven = {name: motion if self._is_driven(name) else replace(motion, end=motion.start) for name, motion in motions.items()}
+        driven = {
+            name: motion if self._is_driven(name) else replace(motion, end=motion.start) for name, motion in motions.items()
+        }
         room, pairs = self._room(done, motions, driven)
         if (waits & (room < 1.0)).any():
             room = np.where((room < 1.0) & (self._room(done, driven, driven)[0] >= 1.0), 1.0, room)
@@ -151,7 +151,9 @@ class Substeps:
         inertia = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
         momentum = np.einsum("bn,bni->bi", weight, np.cross(arm, v - velocity[:, None]))
         spin = np.linalg.solve(inertia, momentum[..., None])[..., 0]
-        return np.where(touched[:, None, None], _move(start, centre, remaining[:, None] * velocity, remaining[:, None] * spin), goal)
+        return np.where(
+            touched[:, None, None], _move(start, centre, remaining[:, None] * velocity, remaining[:, None] * spin), goal
+        )
 
 
 @dataclass(frozen=True)
