@@ -119,7 +119,7 @@ def turn_angle(rotations: np.ndarray) -> np.ndarray:
 
 
 def between(start: np.ndarray, end: np.ndarray, share: float | np.ndarray) -> np.ndarray:
-    """Poses (B, 4, 4) at a ``share``, one or (B,): linear positions, rotations along the shorter arc (slerp)."""
+    """Poses (B, 4, 4) at a ``share``, one or (B,): linear positions, rotations by slerp."""
     share = np.broadcast_to(np.asarray(share, float), len(start))[:, None]
     a, b = quaternions(start), quaternions(end)
     cosine = (a * b).sum(axis=1, keepdims=True)

@@ -40,7 +40,7 @@ _TOLERANCE, _MOST = 1e-6, 5000
 
 @wp.struct
 class RestNodes:
-    """By node: place at rest, C [s²], gradient for unit acceleration [kg], body; 1 if that is bonded."""
+    """By node: place at rest, C [s²], gradient for unit acceleration [kg], body; if bonded."""
 
     rest: VecArray
     compliance: wp.array(dtype=wp.mat33d)
@@ -213,7 +213,9 @@ def responses(layout: Layout, settings: Settings) -> tuple[Floats, Floats]:
             result[nodes] = solved
     forces = np.add.reduceat(blocks @ result[cols], np.searchsorted(rows, np.arange(len(mass))), axis=0)
     fixed = np.isin(layout.node_body, bonded_bodies(layout)) & (layout.node_free == 0)
-    return result, np.where(fixed[:, None, None], forces - mass[:, None, None] * np.eye(3), 0.0)
+    reaction: Floats = np.zeros_like(result)
+    reaction[fixed] = forces[fixed] - mass[fixed, None, None] * np.eye(3)
+    return result, reaction
 
 
 def _solve(blocks: Floats, rows: NDArray, cols: NDArray, right: Floats) -> Floats:

@@ -254,7 +254,7 @@ class SoftPads:
         dt: np.ndarray,
         due: np.ndarray,
     ) -> SceneReport:
-        """Step the solver by ``dt`` (B,) [s] to MuJoCo's present poses, in environments ``due`` (B,)."""
+        """Step the solver by ``dt`` (B,) [s] to MuJoCo's poses, in environments ``due`` (B,)."""
         try:
             report = self.soft.step(cases, driven, dt, due)
         except InputError:

@@ -142,8 +142,9 @@ class SoftScene:
         dt: ArrayLike | None = None,
         envs: ArrayLike | None = None,
     ) -> SceneReport:
-        """Advance environments (mask, list, None: all) by ``dt`` [s], one or (B,) (None: the scene's).
+        """Advance environments by ``dt`` [s], one or (B,); None: the scene's.
 
+        ``envs``: a mask (B,) or list of them, None for all; the others stay as they are.
         Cases move to ``world_from_pad``, (S, 4, 4) or (B, S, 4, 4), and driven bodies to the poses given; others stay.
 
         Two bodies that are near, one of them soft, may move at most ``SubstepLimits.step`` and ``turn`` against each other at a time. The
@@ -196,7 +197,7 @@ class SoftScene:
 
     @property
     def asleep(self) -> np.ndarray:
-        """Environments (B,) that slept through the last step: gels are at rest and nothing touches them."""
+        """Environments (B,) that slept through the last step: nothing touches their gels."""
         return self._asleep.copy()
 
     def _carry(self, goal: Poses, length: np.ndarray, chosen: np.ndarray) -> tuple[SceneReport, np.ndarray]:

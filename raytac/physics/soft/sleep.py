@@ -13,7 +13,7 @@ from raytac.physics.soft.scene_state import Poses
 from raytac.physics.soft.substeps import BoxMotion, Pair, Substeps, clear_of_each_other
 
 _MARGIN = 2.0
-"""Distance that pads must keep from all else during a step, in units of d̂: contact begins at one."""
+"""Distance that pads must keep during a step, in units of d̂: contact begins at one."""
 
 
 class Sleep:

@@ -1,7 +1,8 @@
 """Substeps of a soft scene: division of a step where something soft is near another body.
 
-Every environment divides its own step, as it would alone. What a rigid body does by itself near another rigid one does not divide it: where
-it slides, rolls or falls on a table it moves as far in one step as its speed takes it, and the solver's collision detection keeps it outside.
+Every environment divides its own step, as it would alone. What a rigid body does by itself near another rigid one does not divide
+it: where it slides, rolls or falls on a table it moves as far in one step as its speed takes it, and the solver's collision detection
+keeps it outside.
 """
 
 from __future__ import annotations
@@ -58,11 +59,11 @@ class Substeps:
                 (self.pairs if a.is_soft or b.is_soft else self.rigid_pairs).append(pair)
 
     def next_part(self, done: np.ndarray, now: Poses, goal: Poses, dt: np.ndarray) -> tuple[np.ndarray, dict[int, Pair | None]]:
-        """Parts (B,) of a step of ``dt`` (B,) [s] that may be made next, and the environments to refuse.
+        """Parts (B,) of a step of ``dt`` (B,) [s] that may be made next, and whom to refuse.
 
-        These with the pair that moves too far. Parts are counted in ``limits.most``-ths of the step, as is ``done`` (B,). They are powers
-        of two that divide ``done``; 0 where the step is done, or failed. Free bodies are never refused (a beam may snap back): the solver
-        resolves them, in the smallest parts.
+        The environments to refuse come with the pair that moves too far. Parts are counted in ``limits.most``-ths of the step, as is
+        ``done`` (B,). They are powers of two that divide ``done``; 0 where the step is done, or failed. Free bodies are never refused (a
+        beam may snap back): the solver resolves them, in the smallest parts.
         """
         most, waits = self.limits.most, (done < self.limits.most) & ~self._query.failed
         motions = self.motions(now, goal, dt * (1.0 - done / most))
@@ -93,7 +94,10 @@ class Substeps:
     def _room(
         self, done: np.ndarray, motions: Mapping[str, BoxMotion], driven: Mapping[str, BoxMotion]
     ) -> tuple[np.ndarray, list[Pair | None]]:
-        """Parts of the step that motions allow, (B,), and the pairs that limit it; ``driven``: those of driven bodies alone."""
+        """Parts of the step that motions allow, (B,), and the pairs that limit it.
+
+        ``driven``: motions of driven bodies alone, that count between rigid bodies.
+        """
         share, limiting = np.ones(len(done)), [None] * len(done)
         for chosen, moving in ((self.pairs, motions), (self.rigid_pairs, driven)):
             pairs = [(a, b) for a, b in chosen if not (moving[a].is_still() and moving[b].is_still())]
@@ -103,7 +107,7 @@ class Substeps:
         return (self.limits.most - done) * share * (1.0 + 1e-9), limiting
 
     def motions(self, now: Poses, goal: Poses, remaining: np.ndarray) -> dict[str, BoxMotion]:
-        """Motions of pads and bodies to ``goal``; free ones keep their velocity, ``remaining`` (B,) [s]."""
+        """Motions to ``goal``; free bodies keep their velocity for ``remaining`` (B,) [s]."""
         motions = {}
         for k, (name, pad) in enumerate(self._pads.items()):
             rest, vertices = pad.mesh.tets.vertices, self._query.world.positions(name, frame="body")
