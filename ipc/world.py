@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ipc.bodies.body import AffineBody, Body, HalfSpace, SoftBody, rotation_matrix
 from ipc.bodies.layout import build_layout
-from ipc.contact.overlap import check_overlap, find_overlap
+from ipc.contact.overlap import OverlapCheck, find_overlap
 from ipc.errors import IpcError
 from ipc.report import ContactPairs, PairForces, PatchMotion, RigidMotion, StepReport, Wrench
 from ipc.settings import Settings
@@ -73,6 +73,7 @@ class World:
             self._newton = Newton(self._potential, self.layout, self.settings)
         self._failed = np.zeros(num_envs, bool)
         self._patches: dict[int, RestPatches] = {}
+        self._check_overlap = OverlapCheck(self.layout)
         self._dt = np.full(num_envs, self.settings.dt)
         self._rest: RestState | None = None
         self._expected = np.zeros(num_envs, bool)
@@ -398,7 +399,7 @@ class World:
         ):
             if given != needed:
                 raise IpcError(f"the state has {what} of shape {given}: this world has {needed}")
-        check_overlap(self.layout, state, mask)
+        self._check_overlap(state, mask)
         quaternions = state.frame_rotation[..., [1, 2, 3, 0]]
         with LAUNCH:
             for target, values in (

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ipc
+from ipc.contact import overlap
 from raytac.errors import InputError, OverlapError
 from raytac.physics.soft.bodies import ScenePad, scene_body
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
@@ -151,6 +152,33 @@ def test_environments_have_their_own_poses_and_reset_alone():
     assert scene.pose("cube")[1, 2, 3] == pytest.approx(2e-3) and abs(scene.pose("cube")[0, 2, 3]) < 1e-6
 
 
+def test_a_reset_tests_a_pad_against_itself_once(monkeypatch):
+    """The pad's shape is that of the start, wherever pad and cube are put; what crosses there is refused all the same."""
+    tested = []
+    find = overlap._edge_face_hits
+    monkeypatch.setattr(overlap, "_edge_face_hits", lambda x, edges, faces: (tested.append(len(edges)), find(x, edges, faces))[1])
+    scene = two_pads(num_envs=3)
+    pads = [int(np.diff(scene.world.layout.edge_start[[k, k + 1]])[0]) for k in range(2)]
+    assert tested.count(pads[0]) > 0
+    tested.clear()
+    shifts = np.array([0.0, 0.05e-3, -0.05e-3])
+    starts = {"cube": np.stack([pose(position=(x, 0.0, 0.0)) for x in shifts])}
+    scene.reset([1, 2], world_from_body=starts)
+    # In two environments the cube and each pad, edges of one against triangles of the other; the pads have not moved.
+    assert len(tested) == 2 * 2 * 2 and scene.pose("cube")[:, 0, 3] == pytest.approx(shifts, abs=1e-12)
+    tested.clear()
+    scene.reset([2])
+    scene.reset([1, 2], world_from_body=starts)
+    assert not tested
+    with pytest.raises(OverlapError, match=r"at the poses of the reset: environment 1.*(cube|left)"):
+        scene.reset([1], world_from_body={"cube": pose(position=(0.0, -0.3e-3, 0.0))})
+    assert scene.pose("cube")[1, 0, 3] == pytest.approx(shifts[1], abs=1e-12)
+    state = scene.save()
+    state.world.y[0, scene.world.layout.node_start[0] + MESH.coat_vertices[0]] += (0.0, 0.0, -20e-3)  # through the gel and out of its back
+    with pytest.raises(ipc.OverlapError, match="'left'"):
+        scene.restore(state)
+
+
 def test_what_cannot_be_is_named():
     with pytest.raises(OverlapError, match=r"bodies overlap where they start.*left.*cube"):
         two_pads(gap=-1e-3)
@@ -209,7 +237,7 @@ def test_gravity_is_that_of_the_settings():
     scene = SoftScene(pads, bodies, fingers(5e-3), {"cube": np.eye(4)}, settings=given)
     scene.step(fingers(5e-3))
     assert scene.gravity == pytest.approx([0.0, 1.0, -2.0])
-    assert scene.velocity("cube")[0] == pytest.approx(given.dt * scene.gravity, rel=1e-3)
+    assert scene.velocity("cube")[0] == pytest.approx(given.dt * scene.gravity, rel=1e-3, abs=1e-9)
     with pytest.raises(InputError, match=r"gravity.*left out where settings are given"):
         SoftScene(pads, bodies, fingers(5e-3), {"cube": np.eye(4)}, settings=given, gravity=(0.0, 0.0, 0.0))
 

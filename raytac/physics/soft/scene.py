@@ -106,8 +106,9 @@ class SoftScene:
             self.world = ipc.World([*gels, *solids], self.settings, self.num_envs, device, mu, ignored)
             if settings is None:
                 self.world.set_gravity(self.gravity)
+            self._start_state = self.world.save()
             if self.num_envs > 1:
-                self._place(*self._start, np.ones(self.num_envs, bool))
+                self.world.restore(self._placed(*self._start, np.ones(self.num_envs, bool)))
         except ipc.OverlapError as error:
             raise OverlapError(f"bodies overlap where they start: {error}") from error
         except ipc.IpcError as error:
@@ -366,14 +367,11 @@ class SoftScene:
         if world_from_pad is not None:
             pads = rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(self.pads))
         bodies = self._start[1] | self._registry.named(world_from_body or {}, free=True)
-        before = self.save()
+        placed = SceneState(self._placed(pads, bodies, mask), Poses(pads, self._registry.driven(bodies)))
         try:
-            self.world.restore(self._start_state, mask)
-            self._place(pads, bodies, mask)
+            self.restore(placed, mask)
         except ipc.OverlapError as error:
-            self.world.restore(before.world, mask)
             raise OverlapError(f"bodies overlap at the poses of the reset: {error}") from error
-        self.restore(SceneState(self.world.save(), Poses(pads, self._registry.driven(bodies))), mask)
 
     def fail(self, envs: ArrayLike) -> None:
         """Freeze environments, a mask (B,) or a list, until they are reset."""
@@ -405,9 +403,12 @@ class SoftScene:
         pads = rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(self.pads))
         return Poses(pads, self._now.bodies | self._registry.named(driven or {}))
 
-    def _place(self, pads: np.ndarray, bodies: Mapping[str, np.ndarray], mask: np.ndarray) -> None:
-        """Set the poses of the environments of the mask, undeformed and at rest."""
-        state, layout = self.world.save(), self.world.layout
+    def _placed(self, pads: np.ndarray, bodies: Mapping[str, np.ndarray], mask: np.ndarray) -> ipc.State:
+        """The present state, but for the environments of the mask: undeformed and at rest at these poses."""
+        state, start, layout = self.world.save(), self._start_state, self.world.layout
+        for name in ("y", "velocity", "frame_rotation", "frame_position", "kappa", "failed"):
+            getattr(state, name)[mask] = getattr(start, name)[mask]
+        state.stuck[mask] = -1
         poses = {name: pads[:, k] for k, name in enumerate(self.pads)} | dict(bodies)
         for name, pose in poses.items():
             body = self.bodies.get(name)
@@ -420,7 +421,7 @@ class SoftScene:
             change = pose @ inverse(self._start[1][name][:1])
             nodes_now = np.einsum("bij,nj->bni", change[:, :3, :3], layout.node_rest[nodes]) + change[:, None, :3, 3]
             state.y[mask, nodes] = nodes_now[mask]
-        self.world.restore(state, mask)
+        return state
 
     @staticmethod
     def _at_start(solid, pose: np.ndarray):
