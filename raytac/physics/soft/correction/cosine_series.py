@@ -21,8 +21,15 @@ class CosineSeries:
         """Matrix from values at the nodes to amplitudes, shape (n, n)."""
         self.sine_analysis = 2.0 * np.sin(np.pi * np.outer(order, order) / (n - 1)) / (n - 1)
         """The same for sines, which are 0 at the ends, shape (n, n)."""
-        self.hat = np.sinc(0.5 * order / (n - 1)) ** 2
-        """Amplitudes of hat functions over those of the cosines through the same values, (n,)."""
+
+    def repeated(self, times: int) -> tuple[np.ndarray, np.ndarray]:
+        """Wave numbers [rad/m] shifted by whole turns a node; amplitudes of hat functions, (n,) each.
+
+        The waves look alike at the nodes; the amplitudes are over those of the cosines through the same values.
+        """
+        last = len(self.wave_numbers) - 1
+        order = np.arange(last + 1) + 2 * last * times
+        return np.pi * order / self._length, np.sinc(0.5 * order / last) ** 2
 
     def synthesis(self, t: np.ndarray) -> np.ndarray:
         """Matrix from amplitudes to values at ``t`` [m], shape (P, n)."""
