@@ -22,14 +22,12 @@ class CosineSeries:
         self.sine_analysis = 2.0 * np.sin(np.pi * np.outer(order, order) / (n - 1)) / (n - 1)
         """The same for sines, which are 0 at the ends, shape (n, n)."""
 
-    def repeated(self, times: int) -> tuple[np.ndarray, np.ndarray]:
-        """Wave numbers [rad/m] shifted by whole turns a node; amplitudes of hat functions, (n,) each.
+    def hats(self, order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Wave numbers [rad/m] of orders (m,), 1 for half a wave, and amplitudes of hat functions.
 
-        The waves look alike at the nodes; the amplitudes are over those of the cosines through the same values.
+        The hats are those of the nodes; the amplitudes (m,) are over those of the cosines through the same values.
         """
-        last = len(self.wave_numbers) - 1
-        order = np.arange(last + 1) + 2 * last * times
-        return np.pi * order / self._length, np.sinc(0.5 * order / last) ** 2
+        return np.pi * order / self._length, np.sinc(0.5 * order / (len(self.wave_numbers) - 1)) ** 2
 
     def synthesis(self, t: np.ndarray) -> np.ndarray:
         """Matrix from amplitudes to values at ``t`` [m], shape (P, n)."""

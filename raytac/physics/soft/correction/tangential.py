@@ -120,7 +120,7 @@ class FrictionCorrection:
         cos_x, cos_y = (
             k_axis / np.maximum(k, x.wave_numbers[1] * 1e-9) for k_axis in (x.wave_numbers[None, :], y.wave_numbers[:, None])
         )
-        hats = y.repeated(0)[1][:, None] * x.repeated(0)[1]
+        hats = y.hats(np.arange(len(self._y)))[1][:, None] * x.hats(np.arange(len(self._x)))[1]
         along, across = (law * hats for law in layer_shear(k, gelpad))
         excess = along - across
         laws = across + excess * cos_x**2, excess * cos_x * cos_y, across + excess * cos_y**2
@@ -318,10 +318,10 @@ class TangentialCorrection:
         pitch = self._settings.tangential_pitch
         self._x, self._y = (t[:: max(round(pitch / (t[1] - t[0])), 1)] for t in (normal.x, normal.y))
         series_x, series_y = normal.series_x, normal.series_y
-        resolved = (s.wave_numbers * (t[1] - t[0]) <= np.pi for s, t in ((series_y, self._y), (series_x, self._x)))
+        resolved = tuple(s.wave_numbers * (t[1] - t[0]) <= np.pi for s, t in ((series_y, self._y), (series_x, self._x)))
         self._resolved = np.ix_(*resolved)
         (k_y, hat_y), (k_x, hat_x) = (
-            [line[np.ravel(k)] for line in s.repeated(0)] for s, k in zip((series_y, series_x), self._resolved, strict=True)
+            s.hats(np.flatnonzero(np.ravel(k))) for s, k in zip((series_y, series_x), resolved, strict=True)
         )
         k = np.hypot(k_x[None, :], k_y[:, None])
         ratio = layer_spread(k, gelpad) * (hat_y[:, None] * hat_x) / np.maximum(k, k_x[1])
