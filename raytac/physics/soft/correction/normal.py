@@ -16,11 +16,13 @@ from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
 from raytac.specs.sensor import GelpadSpec
 
 _REPEATS = 8
-"""Repetitions of a pressure's spectrum to each side that are counted: 0.2 % is missing in the shortest waves."""
+"""Repetitions of a pressure's spectrum to each side that are counted.
+
+0.2 % is missing in the shortest waves."""
 _FEW = 17
 """Wave numbers along each axis at which the repetitions are summed."""
 _SHORTEST = 0.5
-"""c of ``_stiffen``, in units of the grid: the fewest steps of the solver for pins, a coin and a gear."""
+"""c of ``_stiffen``, in units of the grid: fewest steps for pins, a coin and a gear."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +195,7 @@ class _Window:
         self._border = c.border_y[rows], c.border_x[:, columns]
 
     def respond(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Cosine amplitudes of p [Pa], (Ny, Nx) of the pad, and the sides' dent [m] at the coat's vertices."""
+        """Cosine amplitudes of p [Pa], (Ny, Nx), and the sides' dent at the coat's vertices [m]."""
         force = sandwich(self._force[0], p, self._force[1])
         border = product(self._sides, force.reshape(-1, 1)).reshape(force.shape)
         return sandwich(self._analysis[0], p, self._analysis[1]), border
