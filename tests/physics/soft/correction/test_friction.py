@@ -11,11 +11,11 @@ import pytest
 
 from raytac.gel.surface import make_grid
 from raytac.physics.bonded_layer import layer_shear
-from raytac.physics.soft.coat_surface import CoatSurface
+from tests.physics.soft.oracles.coat_surface import CoatSurface
 from raytac.physics.soft.correction import tangential
 from raytac.physics.soft.correction.mesh_compliance import coat_compliance
-from raytac.physics.soft.correction.normal import NormalCorrection
-from raytac.physics.soft.correction.tangential import (
+from tests.physics.soft.oracles.normal import NormalCorrection
+from tests.physics.soft.oracles.tangential import (
     FrictionCorrection,
     PlaneMotion,
     TangentialCorrection,

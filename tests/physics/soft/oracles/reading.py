@@ -1,4 +1,4 @@
-"""Reading of a soft pad: surface, contact and forces from the solver's state."""
+"""A soft pad read in NumPy, one pad after the other: the oracle of ``raytac.physics.soft.reading``."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from raytac.gel.coat_mesh import DeformedCoat
 from raytac.gel.interpolate import hat_matrix, sampled
 from raytac.gel.matmul import sandwich
 from raytac.gel.surface import GelSurface, PadGrid, make_grid, rest_height
-from raytac.physics.soft.coat_surface import BarrierClearance, CoatPlaces, CoatSurface
+from tests.physics.soft.oracles.coat_surface import BarrierClearance, CoatPlaces, CoatSurface
 from raytac.physics.soft.correction.mesh_compliance import coat_compliance
-from raytac.physics.soft.correction.normal import ContactSampler, NormalCorrection
-from raytac.physics.soft.correction.tangential import TangentialCorrection
+from tests.physics.soft.oracles.normal import ContactSampler, NormalCorrection
+from tests.physics.soft.oracles.tangential import TangentialCorrection
 from raytac.physics.soft.mesh import PadMesh
 from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
 from raytac.shapes.part import Part, mesh_part
