@@ -21,8 +21,13 @@ class CosineSeries:
         """Matrix from values at the nodes to amplitudes, shape (n, n)."""
         self.sine_analysis = 2.0 * np.sin(np.pi * np.outer(order, order) / (n - 1)) / (n - 1)
         """The same for sines, which are 0 at the ends, shape (n, n)."""
-        self.hat = np.sinc(0.5 * order / (n - 1)) ** 2
-        """Amplitudes of hat functions over those of the cosines through the same values, (n,)."""
+
+    def hats(self, order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Wave numbers [rad/m] of orders (m,), 1 for half a wave, and amplitudes of hat functions.
+
+        The hats are those of the nodes; the amplitudes (m,) are over those of the cosines through the same values.
+        """
+        return np.pi * order / self._length, np.sinc(0.5 * order / (len(self.wave_numbers) - 1)) ** 2
 
     def synthesis(self, t: np.ndarray) -> np.ndarray:
         """Matrix from amplitudes to values at ``t`` [m], shape (P, n)."""

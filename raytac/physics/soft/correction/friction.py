@@ -61,7 +61,8 @@ class FrictionCorrection:
         k = np.hypot(x.wave_numbers[None, :], y.wave_numbers[:, None])
         least = np.maximum(k, x.wave_numbers[1] * 1e-9)
         cos_x, cos_y = x.wave_numbers[None, :] / least, y.wave_numbers[:, None] / least
-        along, across = (law * y.hat[:, None] * x.hat for law in layer_shear(k, gelpad))
+        hats = y.hats(np.arange(len(self.y)))[1][:, None] * x.hats(np.arange(len(self.x)))[1]
+        along, across = (law * hats for law in layer_shear(k, gelpad))
         excess = along - across
         laws = across + excess * cos_x**2, across + excess * cos_y**2, excess * cos_x * cos_y
         self._laws = [products.constant(law).numbers for law in laws]

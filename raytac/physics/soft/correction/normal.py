@@ -10,10 +10,10 @@ import warp as wp
 from raytac.gel.interpolate import SplineAxis, hat_matrix
 from raytac.gel.products import Matrices, Products
 from raytac.gel.surface import PadGrid
-from raytac.physics.bonded_layer import layer_compliance
 from raytac.physics.soft.coat_surface import CoatSurface
 from raytac.physics.soft.correction import normal_kernels as kernels
 from raytac.physics.soft.correction.cosine_series import CosineSeries
+from raytac.physics.soft.correction.nodal_compliance import nodal_compliance
 from raytac.physics.soft.correction.vertex_forces import VertexForces
 from raytac.physics.soft.hats import hat_arrays
 from raytac.physics.soft.settings import Correction
@@ -21,23 +21,28 @@ from raytac.specs.sensor import GelpadSpec
 
 
 class ContactSampler:
-    """Evaluates normal contacts of the fine grid over the lines of another grid."""
+    """Evaluates normal contacts of the fine grid over the lines of another grid, or of its own.
+
+    Between the nodes the dent is a cubic spline: cosines up to the shortest wave of the grid would ring along a sharp rim.
+    """
 
     def __init__(self, correction: NormalCorrection, x: np.ndarray, y: np.ndarray) -> None:
-        mesh, self._products, constant = correction.surface.mesh, correction.products, correction.products.constant
-        self._waves = constant(correction.series_y.synthesis(y)), constant(correction.series_x.synthesis(x).T)
-        self._border = constant(SplineAxis(mesh.lines_y).matrix(y).T), constant(SplineAxis(mesh.lines_x).matrix(x).T)
-        self._over_y = self._products.zeros(len(y), len(correction.x)), self._products.zeros(mesh.shape[1], len(y))
-        nearest = (np.abs(line[:, None] - nodes).argmin(axis=1) for line, nodes in ((y, correction.y), (x, correction.x)))
+        self._products, self._is_own = correction.products, np.array_equal(x, correction.x) and np.array_equal(y, correction.y)
+        lines = (y, correction.y), (x, correction.x)
+        nearest = (np.abs(line[:, None] - nodes).argmin(axis=1) for line, nodes in lines)
         self.nearest = tuple(wp.array(index, dtype=wp.int32, device=self._products.device) for index in nearest)
+        if not self._is_own:
+            over_y, over_x = (SplineAxis(nodes).matrix(line) for line, nodes in lines)
+            self._rows, self._columns = self._products.constant(over_y), self._products.constant(over_x.T)
+            self._spare, self._dent = self._products.zeros(len(y), len(correction.x)), self._products.zeros(len(y), len(x))
 
-    def dent(self, contact: NormalCorrection, out: Matrices) -> None:
-        """Launch the dent of the contacts that were solved last [m]."""
-        multiply, active = self._products.multiply, contact.search.touched
-        multiply(self._waves[0], contact.waves, self._over_y[0], active=active)
-        multiply(self._over_y[0], self._waves[1], out, active=active)
-        multiply(contact.border, self._border[0], self._over_y[1], active=active)
-        multiply(self._over_y[1].transposed, self._border[1], out, active=active, adds=True)
+    def dent(self, contact: NormalCorrection) -> Matrices:
+        """Launch the dent of the contacts that were solved last [m], where they touch."""
+        if self._is_own:
+            return contact.dent
+        self._products.multiply(self._rows, contact.dent, self._spare, active=contact.search.touched)
+        self._products.multiply(self._spare, self._columns, self._dent, active=contact.search.touched)
+        return self._dent
 
 
 class NormalCorrection:
@@ -56,12 +61,15 @@ class NormalCorrection:
     (Correction by the difference of two discretisations of a simplified operator: K. Böhmer, P. Hemker and H. Stetter, The defect
     correction approach, Computing Suppl. 5, 1984.)
 
-    A is the layer's exact compliance (``layer_compliance``) over cosines, as if the pad were continued by its mirror image. The
+    A is the layer's exact response (``layer_compliance``) at the nodes to pressures that are linear between them, wave by wave over
+    cosines, as if the pad were continued by its mirror image. Such pressures have waves shorter than the grid resolves. At the nodes
+    these look like longer ones and are counted there: without them, every jump of pressure at a rim rings as waves of two cells. The
     difference that the pad's free sides make is smooth and is added on the coat's own mesh.
 
     The pressure is solved for by conjugate gradients over the nodes in contact, which are revised in every step (I. A. Polonsky and
-    L. M. Keer, A numerical method for solving rough contact problems, Wear 231, 1999): g is their gap, t the direction, G = g·g, τ the
-    step length.
+    L. M. Keer, A numerical method for solving rough contact problems, Wear 231, 1999), with a preconditioner: g is their gap, z the
+    preconditioned gap, t the direction, G = g·z, τ the step length. z is local and grows with wave number, as A falls: A falls as 1/k.
+    In units of the grid c + k² (c − the five-point Laplacian) times that varies by 7 where 1/k varies by 200.
 
     Attributes of the last ``solve``:
         load: normal force on the vertices [N], (B, V), float64.
@@ -69,8 +77,8 @@ class NormalCorrection:
         mesh_forces: normal forces on the vertices [N] that hold the linear mesh in contact, (B, V), float64.
         rise: w − E w on the lattice [m], as of ``CoatSurface.rise``.
         pressure: p on the fine grid [Pa], >= 0.
-        waves: A p: cosine amplitudes of the dent in the layer [m].
-        border: dent [m] that the pad's free sides add to the layer's, at the vertices, by column and row.
+        waves: cosine amplitudes of the pressure [Pa].
+        dent: A p at the nodes of the fine grid [m], where anything touches.
         forces: of the pressure on the vertices [N], (1, B, V), for products with all environments.
         search: windows, residuals (``best``) and what is in contact (``touched``).
     """
@@ -89,22 +97,23 @@ class NormalCorrection:
         self.x, self.y, mesh, device = grid.x, grid.y, surface.mesh, products.device
         self._wide, count, shape, vertices = mesh.shape[1], products.num_envs, grid.shape, len(mesh.rest)
         self.series_x, self.series_y = CosineSeries(grid.x), CosineSeries(grid.y)
-        waves = np.hypot(self.series_x.wave_numbers[None, :], self.series_y.wave_numbers[:, None])
-        hats = self.series_y.hat[:, None] * self.series_x.hat
-        layer = layer_compliance(waves, gelpad) * hats
+        layer = nodal_compliance(self.series_x, self.series_y, gelpad)
         constant, (ny, nx) = products.constant, shape
         self._layer, self._table = constant(layer), self._distances(layer, nx)
         self._analysis = constant(self.series_y.analysis), constant(self.series_x.analysis.T)
         self._across = constant(self.series_y.analysis.T), constant(self.series_y.synthesis(grid.y).T)
+        self._synthesis_x = constant(self.series_x.synthesis(grid.x).T)
         self._sides = constant((compliance - continued).T)
         area_x, area_y = (_lengths(line) for line in (grid.x, grid.y))
         self._force_y = constant(hat_matrix(mesh.lines_y, grid.y).T * area_y)
         self._force_x = constant(hat_matrix(mesh.lines_x, grid.x) * area_x[:, None])
-        self._border = constant(SplineAxis(mesh.lines_y).matrix(grid.y).T), constant(SplineAxis(mesh.lines_x).matrix(grid.x))
+        border_y, border_x = SplineAxis(mesh.lines_y).matrix(grid.y), SplineAxis(mesh.lines_x).matrix(grid.x)
+        self._border, self._border_x = (constant(border_y.T), constant(border_x)), constant(border_x.T)
         zeros, (rows, columns) = products.zeros, mesh.shape
         self._along_y, self._convolved, self._dent = zeros(nx, ny), zeros(nx, ny), zeros(nx, ny)
+        self._dented, self.dent = zeros(ny, nx), zeros(ny, nx)
         self._over_x, self._over_vertices, self._border_y = zeros(ny, columns), zeros(rows, columns), zeros(columns, ny)
-        self.border = zeros(columns, rows)
+        self._border_at = zeros(columns, rows)
         self.hats = hat_arrays(mesh, grid.x, grid.y, device)
         self.sampler = ContactSampler(self, grid.x, grid.y)
         self._smooth = tuple(wp.array(_smoothing(t), dtype=wp.vec3d, device=device) for t in (mesh.lines_y, mesh.lines_x))
@@ -113,7 +122,7 @@ class NormalCorrection:
         self._spare, self._over = products.zeros(shape[0], surface.lattice[1]), products.zeros(*shape)
         self.rise, self._half, self.waves = products.zeros(*surface.lattice), products.zeros(*shape), products.zeros(*shape)
         self.pressure, self._p, self._t = (products.zeros(*shape) for _ in range(3))
-        self._g, self._overlap, self._start = (products.zeros(*shape) for _ in range(3))
+        self._g, self._z, self._overlap, self._start = (products.zeros(*shape) for _ in range(4))
         self._rest = wp.array(grid.rest, dtype=wp.float64, device=device)
         self.forces, self._borders = (products.zeros(count, vertices, num_envs=1) for _ in range(2))
         self._force_flat, self._border_flat = (one.numbers[0] for one in (self.forces, self._borders))
@@ -121,7 +130,7 @@ class NormalCorrection:
         self.touching = wp.zeros((count, vertices), dtype=wp.int32, device=device)
         self._remainder = wp.zeros((count, 1, vertices), dtype=wp.float64, device=device)
         self._near = wp.zeros((count, shape[0]), dtype=wp.vec2i, device=device)
-        self._sums = wp.zeros((count, shape[0]), dtype=wp.vec3d, device=device)
+        self._sums, self._gaps = (wp.zeros((count, shape[0]), dtype=wp.vec3d, device=device) for _ in range(2))
         self._overlapping = wp.zeros((count, shape[0]), dtype=wp.int32, device=device)
         self._greatest, self._go = wp.zeros(count, dtype=wp.float32, device=device), wp.zeros(1, dtype=wp.int32, device=device)
         search: Any = kernels.Search()
@@ -167,23 +176,23 @@ class NormalCorrection:
         self._launch(kernels.put, 1, [1, self._go])
         with wp.ScopedDevice(self.products.device):
             wp.capture_while(self._go, self._iterate)
-        self._find_waves(self.pressure, s.touched)
-        self._find_border(self.pressure, s.touched)
+        self._find_whole_dent()
 
     def _iterate(self) -> None:
         """Launch one step of the search for the pressure."""
         s, lines, count = self.search, self._near.shape, len(self._greatest)
-        p, t, g = (one.numbers for one in (self._p, self._t, self._g))
+        p, t, g, z = (one.numbers for one in (self._p, self._t, self._g, self._z))
         dent = self._dent.numbers.transpose((0, 2, 1))
         self._find_dent(self._p)
-        self._launch(kernels.gaps, lines, [s, dent, self._overlap.numbers, p, g, self._sums])
-        self._launch(kernels.judge, count, [s, self._sums, self._overlapping, self.settings.gap_tolerance])
-        self._launch(kernels.turn, lines, [s, g, p, self.pressure.numbers, t])
+        self._launch(kernels.gaps, lines, [s, dent, self._overlap.numbers, p, g, self._gaps])
+        self._launch(kernels.stiffen, lines, [s, _SHORTEST, g, p, z, self._sums])
+        self._launch(kernels.judge, count, [s, self._gaps, self._sums, self._overlapping, self.settings.gap_tolerance])
+        self._launch(kernels.turn, lines, [s, z, p, self.pressure.numbers, t])
         self._find_dent(self._t)
         self._launch(kernels.curvatures, lines, [s, dent, g, p, t, self._sums])
         self._launch(kernels.put, 1, [0, self._go])
         self._launch(kernels.choose_length, count, [s, self._sums, self.settings.normal_iterations, self._go])
-        self._launch(kernels.move, lines, [s, g, t, p, self._overlapping])
+        self._launch(kernels.move, lines, [s, _SHORTEST, g, t, p, self._overlapping])
 
     def _find_dent(self, pressure: Matrices) -> None:
         """Launch the dent under a pressure within the windows, by column and row."""
@@ -195,25 +204,30 @@ class NormalCorrection:
         self._launch(kernels.convolve, dim, inputs)
         multiply(self._convolved, self._across[1], self._dent, columns=s.rows, **window)
         self._find_border(pressure, s.active)
-        multiply(self.border, self._border[0], self._border_y, columns=s.rows, active=s.active)
+        multiply(self._border_at, self._border[0], self._border_y, columns=s.rows, active=s.active)
         multiply(self._border[1], self._border_y, self._dent, columns=s.rows, adds=True, **window)
 
     def _find_border(self, pressure: Matrices, active: wp.array) -> None:
-        """Launch what the pad's free sides add under a pressure: ``forces`` and ``border``."""
+        """Launch what the pad's free sides add under a pressure: ``forces`` and the dent at the vertices."""
         s, multiply = self.search, self.products.multiply
         multiply(pressure, self._force_x, self._over_x, rows=s.rows, inner=s.columns, active=active)
         multiply(self._force_y, self._over_x, self._over_vertices, inner=s.rows, active=active)
         self._launch(kernels.flatten, self.load.shape, [self._over_vertices.numbers, self._force_flat])
         multiply(self.forces, self._sides, self._borders)
-        self._launch(kernels.fold, self.load.shape, [self._border_flat, self.border.numbers])
+        self._launch(kernels.fold, self.load.shape, [self._border_flat, self._border_at.numbers])
 
-    def _find_waves(self, pressure: Matrices, active: wp.array) -> None:
-        """Launch the amplitudes of the dent in the layer, of a pressure within the windows."""
-        s, multiply = self.search, self.products.multiply
-        multiply(self._analysis[0], pressure, self._half, inner=s.rows, columns=s.columns, active=active)
+    def _find_whole_dent(self) -> None:
+        """Launch ``waves``, ``forces`` and ``dent`` of the pressure that was found."""
+        s, multiply, active = self.search, self.products.multiply, self.search.touched
+        multiply(self._analysis[0], self.pressure, self._half, inner=s.rows, columns=s.columns, active=active)
         multiply(self._half, self._analysis[1], self.waves, inner=s.columns, active=active)
-        lines = (len(active), self.waves.shape[0])
-        self._launch(kernels.scale, lines, [active, self._layer.numbers, self.waves.numbers])
+        fields = [active, self._layer.numbers, self.waves.numbers, self._dented.numbers]
+        self._launch(kernels.scale, (len(active), self.waves.shape[0]), fields)
+        multiply(self._across[1].transposed, self._dented, self._half, active=active)
+        multiply(self._half, self._synthesis_x, self.dent, active=active)
+        self._find_border(self.pressure, active)
+        multiply(self._border_at, self._border[0], self._border_y, active=active)
+        multiply(self._border_y.transposed, self._border_x, self.dent, active=active, adds=True)
 
     def _distances(self, layer: np.ndarray, nodes: int) -> wp.array:
         """Response c at a distance along x to a line load, for each wave along y (see ``convolve``).
@@ -236,6 +250,8 @@ _SEARCH = {
     "active": wp.int32, "touched": wp.int32, "rows": wp.vec2i, "columns": wp.vec2i, "last": wp.float64, "beta": wp.float32,
     "tau": wp.float32, "best": wp.float64, "improved": wp.int32, "count": wp.int32,
 }  # fmt: skip
+_SHORTEST = 0.5
+"""c of the preconditioner, in units of the grid: the fewest steps for pins, a coin and a gear."""
 _SAME = 1e-12
 """Difference of the heights of vertices that is none [m]."""
 _MOST = 2000

@@ -208,24 +208,59 @@ def gaps(
     g: wp.array3d(dtype=wp.float32),
     sums: wp.array2d(dtype=wp.vec3d),
 ):  # fmt: skip
-    """g = A p − overlap along a row, and its G, least g, and greatest |g| under pressure."""
+    """g = A p − overlap along a row, its least, and the greatest |g| under pressure."""
     env, row = wp.tid()
     columns, rows = s.columns[env], s.rows[env]
     if s.active[env] == 0 or row < rows[0] or row >= rows[1]:
         return
-    square, least, most = wp.float64(0.0), wp.float32(1e30), wp.float32(0.0)
+    least, most = wp.float32(1e30), wp.float32(0.0)
     for i in range(columns[0], columns[1]):
         gap = dent[env, row, i] - overlap[env, row, i]
         g[env, row, i] = gap
         least = wp.min(least, gap)
         if p[env, row, i] > _ZERO:
-            square += wp.float64(gap) * wp.float64(gap)
             most = wp.max(most, wp.abs(gap))
-    sums[env, row] = wp.vec3d(square, wp.float64(least), wp.float64(most))
+    sums[env, row] = wp.vec3d(wp.float64(least), wp.float64(most), _0)
+
+
+@wp.func
+def pressed(s: Search, env: wp.int32, row: wp.int32, i: wp.int32, g: wp.array3d(dtype=wp.float32), p: wp.array3d(dtype=wp.float32)):
+    """g at a node under pressure, 0 elsewhere."""
+    columns, rows, value = s.columns[env], s.rows[env], wp.float32(0.0)
+    if row >= rows[0] and row < rows[1] and i >= columns[0] and i < columns[1]:
+        if p[env, row, i] > _ZERO:
+            value = value + g[env, row, i]
+    return value
 
 
 @wp.kernel
-def judge(s: Search, sums: wp.array2d(dtype=wp.vec3d), overlapping: wp.array2d(dtype=wp.int32), tolerance: wp.float64):
+def stiffen(
+    s: Search, shortest: wp.float32, g: wp.array3d(dtype=wp.float32), p: wp.array3d(dtype=wp.float32),
+    # outputs
+    z: wp.array3d(dtype=wp.float32),
+    sums: wp.array2d(dtype=wp.vec3d),
+):  # fmt: skip
+    """Preconditioned gap z along a row, and g·z: ``shortest`` − the five-point Laplacian, of g under pressure."""
+    env, row = wp.tid()
+    columns, rows = s.columns[env], s.rows[env]
+    if s.active[env] == 0 or row < rows[0] or row >= rows[1]:
+        return
+    total = wp.float64(0.0)
+    for i in range(columns[0], columns[1]):
+        if p[env, row, i] > _ZERO:
+            around = pressed(s, env, row - 1, i, g, p) + pressed(s, env, row + 1, i, g, p)
+            around += pressed(s, env, row, i - 1, g, p) + pressed(s, env, row, i + 1, g, p)
+            value = (wp.float32(4.0) + shortest) * g[env, row, i] - around
+            z[env, row, i] = value
+            total += wp.float64(g[env, row, i] * value)
+    sums[env, row] = wp.vec3d(total, _0, _0)
+
+
+@wp.kernel
+def judge(
+    s: Search, gaps: wp.array2d(dtype=wp.vec3d), sums: wp.array2d(dtype=wp.vec3d), overlapping: wp.array2d(dtype=wp.int32),
+    tolerance: wp.float64,
+):  # fmt: skip
     """Residual of each environment, whether it is solved, and β of the next direction."""
     env = wp.tid()
     s.improved[env] = 0
@@ -233,9 +268,8 @@ def judge(s: Search, sums: wp.array2d(dtype=wp.vec3d), overlapping: wp.array2d(d
         return
     square, least, most, added = wp.float64(0.0), wp.float64(1e30), wp.float64(0.0), wp.int32(0)
     for row in range(s.rows[env][0], s.rows[env][1]):
-        one = sums[env, row]
-        square += one[0]
-        least, most = wp.min(least, one[1]), wp.max(most, one[2])
+        least, most = wp.min(least, gaps[env, row][0]), wp.max(most, gaps[env, row][1])
+        square += sums[env, row][0]
         added = wp.max(added, overlapping[env, row])
     residual = wp.max(-least, most)
     if residual < s.best[env]:
@@ -252,12 +286,12 @@ def judge(s: Search, sums: wp.array2d(dtype=wp.vec3d), overlapping: wp.array2d(d
 
 @wp.kernel
 def turn(
-    s: Search, g: wp.array3d(dtype=wp.float32), p: wp.array3d(dtype=wp.float32),
+    s: Search, z: wp.array3d(dtype=wp.float32), p: wp.array3d(dtype=wp.float32),
     # outputs
     best: wp.array3d(dtype=wp.float32),
     t: wp.array3d(dtype=wp.float32),
 ):  # fmt: skip
-    """Direction t = g + β t under pressure, and the best pressure so far, by (environment, row)."""
+    """Direction t = z + β t under pressure, and the best pressure so far, by (environment, row)."""
     env, row = wp.tid()
     columns, rows = s.columns[env], s.rows[env]
     if row < rows[0] or row >= rows[1]:
@@ -268,7 +302,7 @@ def turn(
     if s.active[env] != 0:
         for i in range(columns[0], columns[1]):
             if p[env, row, i] > _ZERO:
-                t[env, row, i] = g[env, row, i] + s.beta[env] * t[env, row, i]
+                t[env, row, i] = z[env, row, i] + s.beta[env] * t[env, row, i]
             else:
                 t[env, row, i] = _ZERO
 
@@ -319,7 +353,7 @@ def choose_length(s: Search, sums: wp.array2d(dtype=wp.vec3d), most: wp.int32, g
 
 @wp.kernel
 def move(
-    s: Search, g: wp.array3d(dtype=wp.float32), t: wp.array3d(dtype=wp.float32),
+    s: Search, shortest: wp.float32, g: wp.array3d(dtype=wp.float32), t: wp.array3d(dtype=wp.float32),
     # outputs
     p: wp.array3d(dtype=wp.float32),
     overlapping: wp.array2d(dtype=wp.int32),
@@ -335,7 +369,7 @@ def move(
         if p[env, row, i] > _ZERO:
             value = wp.max(p[env, row, i] - tau * t[env, row, i], _ZERO)
         if value <= _ZERO and g[env, row, i] < _ZERO:
-            value = value - tau * g[env, row, i]
+            value = value - tau * shortest * g[env, row, i]
             added = wp.int32(1)
         p[env, row, i] = value
     overlapping[env, row] = added
@@ -356,13 +390,17 @@ def fold(values: wp.array2d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32)
 
 
 @wp.kernel
-def scale(active: wp.array(dtype=wp.int32), factor: wp.array3d(dtype=wp.float32), field: wp.array3d(dtype=wp.float32)):
+def scale(
+    active: wp.array(dtype=wp.int32), factor: wp.array3d(dtype=wp.float32), field: wp.array3d(dtype=wp.float32),
+    # outputs
+    out: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
     """Field times a factor for all environments, by (environment, row)."""
     env, row = wp.tid()
     if active[env] == 0:
         return
     for i in range(field.shape[2]):
-        field[env, row, i] = field[env, row, i] * factor[0, row, i]
+        out[env, row, i] = field[env, row, i] * factor[0, row, i]
 
 
 @wp.kernel

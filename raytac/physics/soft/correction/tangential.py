@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from raytac.physics.bonded_layer import layer_compliance, layer_spread
+from raytac.physics.bonded_layer import layer_spread
 from raytac.physics.soft.correction import force_kernels
 from raytac.physics.soft.correction import tangential_kernels as kernels
 from raytac.physics.soft.correction.friction import FrictionCorrection
@@ -54,9 +54,9 @@ class TangentialCorrection:
         x, y = (t[:: max(round(pitch / (t[1] - t[0])), 1)] for t in (normal.x, normal.y))
         series = normal.series_x, normal.series_y
         resolved = [int((one.wave_numbers * (t[1] - t[0]) <= np.pi).sum()) for one, t in zip(series, (x, y), strict=True)]
-        k_x, k_y = (one.wave_numbers[:count] for one, count in zip(series, resolved, strict=True))
+        (k_x, hat_x), (k_y, hat_y) = (one.hats(np.arange(count)) for one, count in zip(series, resolved, strict=True))
         k = np.hypot(k_x[None, :], k_y[:, None])
-        ratio = layer_spread(k, gelpad) / layer_compliance(k, gelpad) / np.maximum(k, k_x[1])
+        ratio = layer_spread(k, gelpad) * (hat_y[:, None] * hat_x) / np.maximum(k, k_x[1])
         self._spread = [products.constant(ratio * along).numbers for along in (k_x, k_y[:, None])]
         shape = len(k_y), len(k_x)
         self._synthesis, self._lines = PlaneWaves(series, x, y, products, shape), node_lines(x, y)

@@ -10,7 +10,7 @@ import numpy as np
 from raytac.gel.components import span
 from raytac.gel.interpolate import sampled
 from raytac.gel.matmul import product, sandwich
-from raytac.physics.bonded_layer import layer_compliance, layer_shear, layer_spread
+from raytac.physics.bonded_layer import layer_shear, layer_spread
 from raytac.physics.soft.correction.cosine_series import CosineSeries
 from tests.physics.soft.oracles.normal import NormalContact, NormalCorrection
 from raytac.specs.sensor import GelpadSpec
@@ -120,7 +120,8 @@ class FrictionCorrection:
         cos_x, cos_y = (
             k_axis / np.maximum(k, x.wave_numbers[1] * 1e-9) for k_axis in (x.wave_numbers[None, :], y.wave_numbers[:, None])
         )
-        along, across = (law * y.hat[:, None] * x.hat for law in layer_shear(k, gelpad))
+        hats = y.hats(np.arange(len(self._y)))[1][:, None] * x.hats(np.arange(len(self._x)))[1]
+        along, across = (law * hats for law in layer_shear(k, gelpad))
         excess = along - across
         laws = across + excess * cos_x**2, excess * cos_x * cos_y, across + excess * cos_y**2
         self._layer = tuple(law.astype(np.float32) for law in laws)
@@ -317,11 +318,13 @@ class TangentialCorrection:
         pitch = self._settings.tangential_pitch
         self._x, self._y = (t[:: max(round(pitch / (t[1] - t[0])), 1)] for t in (normal.x, normal.y))
         series_x, series_y = normal.series_x, normal.series_y
-        resolved = (s.wave_numbers * (t[1] - t[0]) <= np.pi for s, t in ((series_y, self._y), (series_x, self._x)))
+        resolved = tuple(s.wave_numbers * (t[1] - t[0]) <= np.pi for s, t in ((series_y, self._y), (series_x, self._x)))
         self._resolved = np.ix_(*resolved)
-        k_y, k_x = (s.wave_numbers[np.ravel(k)] for s, k in zip((series_y, series_x), self._resolved, strict=True))
+        (k_y, hat_y), (k_x, hat_x) = (
+            s.hats(np.flatnonzero(np.ravel(k))) for s, k in zip((series_y, series_x), resolved, strict=True)
+        )
         k = np.hypot(k_x[None, :], k_y[:, None])
-        ratio = layer_spread(k, gelpad) / layer_compliance(k, gelpad) / np.maximum(k, k_x[1])
+        ratio = layer_spread(k, gelpad) * (hat_y[:, None] * hat_x) / np.maximum(k, k_x[1])
         self._spread = np.stack([ratio * k_x, ratio * k_y[:, None]]).astype(np.float32)
         over_x, over_y = plane_waves(series_x, series_y, self._x, self._y)
         self._lines = tuple(np.asfortranarray(m[: len(k_x)]) for m in over_x), tuple(m[:, : len(k_y)] for m in over_y)
