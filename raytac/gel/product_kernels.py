@@ -19,6 +19,10 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 ROWS = 4
 """Rows that a thread computes together."""
+CPU_LANES, CUDA_LANES = 16, 4
+"""Numbers in a packet: two vector registers of AVX2, one load of CUDA."""
+PACKETS = {lanes: wp.types.vector(length=lanes, dtype=wp.float32) for lanes in (CPU_LANES, CUDA_LANES)}
+"""Types of packets; kernels for both are compiled together, since a recording does not outlive its module."""
 
 
 @wp.kernel
@@ -66,3 +70,7 @@ def multiply(
         out[env, j + 1, p] = b
         out[env, j + 2, p] = c
         out[env, j + 3, p] = d
+
+
+for _packet in PACKETS.values():
+    wp.overload(multiply, {"right": wp.array3d(dtype=_packet), "out": wp.array3d(dtype=_packet)})

@@ -9,11 +9,7 @@ import numpy as np
 import warp as wp
 
 from raytac.gel import product_kernels as kernels
-from raytac.gel.surround_kernels import packet_types
 from raytac.warp_runtime import start_warp
-
-_CPU_LANES, _CUDA_LANES = 16, 4
-"""Numbers in a packet: two vector registers of AVX2, one load of CUDA."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +37,7 @@ class Products:
     def __init__(self, num_envs: int, device: Any) -> None:
         start_warp()
         self.num_envs, self.device = num_envs, wp.get_device(device)
-        self.lanes = _CPU_LANES if self.device.is_cpu else _CUDA_LANES
+        self.lanes = kernels.CPU_LANES if self.device.is_cpu else kernels.CUDA_LANES
         self._spans: dict[int, wp.array] = {}
         self.all = wp.full(num_envs, value=1, dtype=wp.int32, device=self.device)
         """Marks every environment as active."""
@@ -66,7 +62,7 @@ class Products:
         filled[:, :rows, :columns] = values
         padded: Any = wp.array(filled, dtype=wp.float32, device=self.device)
         packets: Any = wp.array(
-            ptr=padded.ptr, shape=(count, lines, width // self.lanes), dtype=packet_types(self.lanes)[0], device=self.device
+            ptr=padded.ptr, shape=(count, lines, width // self.lanes), dtype=kernels.PACKETS[self.lanes], device=self.device
         )
         packets._numbers = padded  # whose memory it is
         return Matrices(packets, padded, padded[:, :rows, :columns], (rows, columns))

@@ -10,7 +10,10 @@ import ipc
 from tests.ipc.conftest import bonded_pad, small_pad
 
 RADIUS, GAP = 4e-3, 1.2e-4
-DEVICES = ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not wp.is_cuda_available(), reason="needs CUDA")])]
+DEVICES = [
+    "cpu",
+    pytest.param("cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not wp.is_cuda_available(), reason="needs CUDA")]),
+]
 
 
 def pressed(device: str, num_envs: int = 2) -> ipc.World:

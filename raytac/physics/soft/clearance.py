@@ -62,7 +62,7 @@ class BarrierClearance:
         self._surface.rise(self._lattice)
         self._products.sandwich(self._rows, self._lattice, self._columns, self._spare, self._rise)
         self.undersides.find(objects, sound, self._unmoved)
-        self.undersides.remove_behind(objects, self._rise.numbers)
+        self.undersides.remove_behind(objects, self._rise.numbers, self._unmoved)
         self._launch(kernels.pressures, forces.shape, [self._surface.struct, sound, forces, self._pressure])
         self._launch(kernels.lowest_in_rows, self._sums.shape, [under, self._lowest_rows])
         self._launch(kernels.lowest_of_rows, len(self._lowest), [self._lowest_rows, self._lowest])

@@ -93,7 +93,13 @@ def on_pad(lines: wp.array(dtype=wp.float64), t: wp.float64) -> wp.float64:
 
 @wp.func
 def spline_at(
-    fields: wp.array4d(dtype=wp.float64), env: wp.int32, c: wp.int32, corner: wp.int32, columns: wp.int32, x: wp.vec4d, y: wp.vec4d
+    fields: wp.array4d(dtype=wp.float64),
+    env: wp.int32,
+    c: wp.int32,
+    corner: wp.int32,
+    columns: wp.int32,
+    x: wp.vec4d,
+    y: wp.vec4d,
 ) -> wp.float64:
     """Value of component ``c`` of ``bend_columns`` in the cell of ``corner``."""
     total = wp.float64(0.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,8 +14,9 @@ import ipc
 from raytac.errors import InputError, OverlapError
 from raytac.gel.surface import PadGrid, chosen_envs, make_grid
 from raytac.physics.soft.bodies import SceneBody, ScenePad, SceneRegistry, pad_body
+from raytac.physics.soft.coat_state import CoatState, SceneCoat
 from raytac.physics.soft.mesh import pad_stiffness
-from raytac.physics.soft.reading import CoatState, ContactObject, SoftReader, SoftReading
+from raytac.physics.soft.reading import SoftReader, SoftReading
 from raytac.physics.soft.scene_state import Poses, SceneReport, SceneState
 from raytac.physics.soft.settings import SceneSettings
 from raytac.physics.soft.substeps import Substeps
@@ -115,6 +117,7 @@ class SoftScene:
         self._now = Poses(self._start[0], self._registry.driven(self._start[1])).copy()
         self._substeps = Substeps(self.pads, self.bodies, self, accuracy.substeps)
         self._readers: dict[str, SoftReader] = {}
+        self._coats: dict[str, SceneCoat] = {}
         self._coat_numbers = {name: self._surface_numbers(pad) for name, pad in self.pads.items()}
         self._failed = np.zeros(self.num_envs, bool)
 
@@ -264,18 +267,21 @@ class SoftScene:
         return self._readers[pad].read(self.coat_state(pad), self._failed if failed is None else self._failed | failed)
 
     def coat_state(self, pad: str) -> CoatState:
-        """A pad's coat with the forces on it, and the objects that it touches."""
-        frame = inverse(self.pose(self._registry.pad(pad).name))
-        objects = []
-        for name, touching in self.world.touching(pad).items():
-            body = self.bodies.get(name)
-            if body is not None and not body.is_soft:
-                # As in the solver, the last coefficient of a pair counts if it was given in both orders.
-                mu = [mu for pair, mu in self._friction.items() if set(pair) == {pad, name}][-1]
-                objects.append(ContactObject(body.parts, frame @ self.pose(name), None, touching, mu))
-            elif name != pad:
-                objects.append(ContactObject((), frame @ self.pose(name), self.skin(name, pad), touching))
-        return CoatState(self.coat(pad), self.coat_forces(pad), tuple(objects))
+        """A pad's coat with the forces on it, and the objects that it touches, on the device.
+
+        The next call overwrites it.
+        """
+        if pad not in self._coats:
+            others = [other for name, other in self.pads.items() if name != pad]
+            # As in the solver, the last coefficient of a pair counts if it was given in both orders.
+            friction = {name: mu for pair, mu in self._friction.items() if pad in pair for name in pair if name != pad}
+            self._coats[pad] = SceneCoat(self.world, self._registry.pad(pad), others, self.bodies, friction)
+        coat = self._coats[pad]
+        state = coat.read()
+        for name, k in coat.free.items():  # the rotation that fits a soft body best comes from the host
+            column: Any = state.objects.poses[:, k]
+            column.assign(inverse(self.pose(pad)) @ self.pose(name))
+        return state
 
     def save(self) -> SceneState:
         """The state of every environment."""

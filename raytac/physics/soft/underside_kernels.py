@@ -125,6 +125,7 @@ def underside_of_triangles(
 @wp.kernel
 def remove_behind(
     touching: wp.array2d(dtype=wp.bool),
+    clearance: wp.array(dtype=wp.float64),
     rest: wp.array2d(dtype=wp.float64),
     rise: wp.array3d(dtype=wp.float32),
     # outputs
@@ -136,7 +137,7 @@ def remove_behind(
     for body in range(touching.shape[1]):
         if touching[env, body]:
             count += 1
-    if count < 2:
+    if count < 2 or not wp.isfinite(clearance[env]):
         return
     for i in range(under.shape[2]):
         if under[env, row, i] < rest[row, i] + wp.float64(rise[env, row, i]) - _BEHIND:

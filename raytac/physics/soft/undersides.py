@@ -68,10 +68,13 @@ class Undersides:
             surface = [len(objects.shapes) + k, vertices, faces, lowered, self._nodes, self.under]
             self._launch(kernels.underside_of_triangles, (count, len(faces)), [sound, objects.touching, *surface])
 
-    def remove_behind(self, objects: Touched, rise: wp.array) -> None:
-        """Launch the removal of what is far below the smooth coat, at ``rise`` (B, Ny, Nx) [m]."""
+    def remove_behind(self, objects: Touched, rise: wp.array, clearance: wp.array) -> None:
+        """Launch the removal of what is far below the smooth coat, at ``rise`` (B, Ny, Nx) [m].
+
+        It is for pads that several objects touch; none where the ``clearance`` (B,) is not finite.
+        """
         if objects.touching.shape[1] > 1:
-            inputs = [objects.touching, self._nodes.rest, rise, self.under]
+            inputs = [objects.touching, clearance, self._nodes.rest, rise, self.under]
             self._launch(kernels.remove_behind, self.under.shape[:2], inputs)
 
     def _arrays(self, shapes: tuple[Sequence[Part], ...]) -> tuple[Any, ShapeArrays, Any, wp.array, wp.array]:

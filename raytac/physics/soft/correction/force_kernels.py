@@ -7,8 +7,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import warp as wp
 
 from ipc.solver.pcg_block import block_sum, wait_for_block
@@ -32,7 +30,7 @@ class Unknowns:
 
 @wp.kernel
 def solve_in_one_block(
-    matrix: wp.array2d(dtype=Any),
+    matrix: wp.array2d(dtype=wp.float64),
     unknowns: Unknowns,
     wanted: wp.array2d(dtype=wp.float64),
     tolerance: wp.float64,
@@ -74,7 +72,7 @@ def solve_in_one_block(
             row = unknowns.index[env, i]
             total = wp.float64(0.0)
             for k in range(n):
-                total += wp.float64(matrix[row, unknowns.index[env, k]]) * p[env, k]
+                total += matrix[row, unknowns.index[env, k]] * p[env, k]
             Ap[env, i] = total
             a += p[env, i] * total
             i += threads
@@ -104,7 +102,7 @@ def solve_in_one_block(
 
 @wp.kernel
 def respond(
-    matrix: wp.array2d(dtype=Any), unknowns: Unknowns, forces: wp.array2d(dtype=wp.float64),
+    matrix: wp.array2d(dtype=wp.float64), unknowns: Unknowns, forces: wp.array2d(dtype=wp.float64),
     # outputs
     moved: wp.array2d(dtype=wp.float64),
 ):  # fmt: skip
@@ -113,5 +111,12 @@ def respond(
     total = wp.float64(0.0)
     for k in range(unknowns.count[env]):
         number = unknowns.index[env, k]
-        total += wp.float64(matrix[row, number]) * forces[env, number]
+        total += matrix[row, number] * forces[env, number]
     moved[env, row] = total
+
+
+@wp.kernel
+def take_component(values: wp.array3d(dtype=wp.float64), component: wp.int32, out: wp.array2d(dtype=wp.float64)):
+    """One component of values (B, C, n)."""
+    env, i = wp.tid()
+    out[env, i] = values[env, component, i]

@@ -77,7 +77,7 @@ class FrictionCorrection:
         self._bound, self._layer = products.zeros(*shape), PlaneField.zeros(products, *mesh.shape)
         # Unknown c V + i: component c of vertex i.
         n = 2 * len(mesh.rest)
-        self._holding = VertexForces(compliance.transpose(1, 2, 0, 3).reshape(n, n).astype(np.float32), products)
+        self._holding = VertexForces(compliance.transpose(1, 2, 0, 3).reshape(n, n), products)
         self._nodes, self._fine = node_lines(self.x, self.y), node_lines(normal.x, normal.y)
         count, rows = products.num_envs, shape[0]
         contact: Any = kernels.Contact()

@@ -14,7 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from raytac.gel.product_kernels import ROWS
+from raytac.gel.product_kernels import PACKETS, ROWS
 from raytac.physics.soft.clearance_kernels import Hats
 from raytac.physics.soft.correction.force_kernels import Unknowns
 
@@ -140,7 +140,9 @@ def overlaps(
 
 
 @wp.kernel
-def choose_windows(sound: wp.array(dtype=wp.int32), clearance: wp.array(dtype=wp.float64), near: wp.array2d(dtype=wp.vec2i), s: Search):
+def choose_windows(
+    sound: wp.array(dtype=wp.int32), clearance: wp.array(dtype=wp.float64), near: wp.array2d(dtype=wp.vec2i), s: Search
+):
     """Window of each environment, and the state at the start of the search."""
     env = wp.tid()
     columns, rows = wp.vec2i(2147483647, 0), wp.vec2i(near.shape[1], 0)
@@ -192,9 +194,8 @@ def begin(
     is_in = row >= rows[0] and row < rows[1]
     for i in range(p.shape[2]):
         value = wp.float32(0.0)
-        if is_in and i >= columns[0] and i < columns[1]:
-            if overlap[env, row, i] > _ZERO:
-                value = wp.max(start[env, row, i], greatest[env] * wp.float32(1e-3))
+        if is_in and i >= columns[0] and i < columns[1] and overlap[env, row, i] > _ZERO:
+            value = wp.max(start[env, row, i], greatest[env] * wp.float32(1e-3))
         p[env, row, i] = value
         best[env, row, i] = value
         t[env, row, i] = _ZERO
@@ -224,13 +225,16 @@ def gaps(
 
 
 @wp.func
-def pressed(s: Search, env: wp.int32, row: wp.int32, i: wp.int32, g: wp.array3d(dtype=wp.float32), p: wp.array3d(dtype=wp.float32)):
+def pressed(
+    s: Search, env: wp.int32, row: wp.int32, i: wp.int32, g: wp.array3d(dtype=wp.float32), p: wp.array3d(dtype=wp.float32)
+):
     """g at a node under pressure, 0 elsewhere."""
-    columns, rows, value = s.columns[env], s.rows[env], wp.float32(0.0)
-    if row >= rows[0] and row < rows[1] and i >= columns[0] and i < columns[1]:
-        if p[env, row, i] > _ZERO:
-            value = value + g[env, row, i]
-    return value
+    columns, rows = s.columns[env], s.rows[env]
+    if row < rows[0] or row >= rows[1] or i < columns[0] or i >= columns[1]:
+        return wp.float32(0.0)
+    if p[env, row, i] > _ZERO:
+        return g[env, row, i]
+    return wp.float32(0.0)
 
 
 @wp.kernel
@@ -437,6 +441,12 @@ def convolve(
         out[env, i + 1, p] = b
         out[env, i + 2, p] = c
         out[env, i + 3, p] = d
+
+
+for _packet in PACKETS.values():
+    wp.overload(
+        convolve, {"table": wp.array2d(dtype=_packet), "half": wp.array3d(dtype=_packet), "out": wp.array3d(dtype=_packet)}
+    )
 
 
 @wp.kernel

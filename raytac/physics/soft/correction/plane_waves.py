@@ -49,7 +49,9 @@ class PlaneWaves:
         self._cos_y, self._sin_y = (constant(f(y)[:, :rows]) for f in (along[1].synthesis, along[1].sines))
         self._spare = products.zeros(len(y), columns)
 
-    def displacement(self, amplitudes: PlaneField, out: PlaneField, active: wp.array, window: tuple[Any, Any] = (None, None)) -> None:
+    def displacement(
+        self, amplitudes: PlaneField, out: PlaneField, active: wp.array, window: tuple[Any, Any] = (None, None)
+    ) -> None:
         """Launch the displacement [m] within windows of rows and columns; None is all."""
         multiply, (rows, columns) = self._products.multiply, window
         for along_y, along_x, wave, field in (

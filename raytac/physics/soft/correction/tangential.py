@@ -48,7 +48,7 @@ class TangentialCorrection:
         self._normal, self._settings, products = normal, normal.settings, normal.products
         self._products, device, vertices = products, products.device, len(compliance[0])
         self._friction = FrictionCorrection(normal, gelpad, continued[:2, :2]) if self._settings.friction else None
-        self._mesh = wp.array(compliance[:2].reshape(2 * vertices, vertices).astype(np.float32), device=device)
+        self._mesh = wp.array(compliance[:2].reshape(2 * vertices, vertices), dtype=wp.float64, device=device)
         self._side_law = products.constant((compliance[:2] - continued[2, :2]).reshape(2 * vertices, vertices).T)
         pitch = self._settings.tangential_pitch
         x, y = (t[:: max(round(pitch / (t[1] - t[0])), 1)] for t in (normal.x, normal.y))

@@ -22,9 +22,9 @@ class VertexForces:
     """
 
     def __init__(self, matrix: np.ndarray, products: Products) -> None:
-        """``matrix``: compliance (n, n) [m/N], symmetric, float32 or float64."""
+        """``matrix``: compliance (n, n) [m/N], symmetric."""
         self._device, (n, _), count = products.device, matrix.shape, products.num_envs
-        self._matrix = wp.array(np.ascontiguousarray(matrix), device=self._device)
+        self._matrix = wp.array(np.ascontiguousarray(matrix), dtype=wp.float64, device=self._device)
         self.can_move = wp.array(np.diagonal(matrix) > 0.0, dtype=wp.int32, device=self._device)
         unknowns: Any = kernels.Unknowns()
         unknowns.count = wp.zeros(count, dtype=wp.int32, device=self._device)
@@ -36,8 +36,8 @@ class VertexForces:
 
     def wanted_from(self, values: wp.array, component: int) -> None:
         """Launch that one component of ``values`` (B, C, n) [m] is wanted."""
-        part: Any = values[:, component]
-        wp.copy(self.wanted, part)
+        inputs = [values, component, self.wanted]
+        wp.launch(kernels.take_component, dim=self.wanted.shape, inputs=inputs, device=self._device)
 
     def solve(self, tolerance: float, most: int) -> None:
         """Launch the solution, to a residual below ``tolerance`` [m], in at most so many steps."""
@@ -45,7 +45,7 @@ class VertexForces:
         wp.launch(
             kernels.solve_in_one_block,
             dim=(len(self.wanted), threads),
-            inputs=[self._matrix, self.unknowns, self.wanted, wp.float64(tolerance), most, threads, self._r, self._p, self._Ap, self.forces],
+            inputs=[self._matrix, self.unknowns, self.wanted, tolerance, most, threads, self._r, self._p, self._Ap, self.forces],
             device=self._device,
             block_dim=threads,
         )

@@ -13,15 +13,15 @@ from raytac.gel.coat_mesh import DeformedCoat
 from raytac.gel.interpolate import hat_matrix, sampled
 from raytac.gel.matmul import sandwich
 from raytac.gel.surface import GelSurface, PadGrid, make_grid, rest_height
-from tests.physics.soft.oracles.coat_surface import BarrierClearance, CoatPlaces, CoatSurface
 from raytac.physics.soft.correction.mesh_compliance import coat_compliance
-from tests.physics.soft.oracles.normal import ContactSampler, NormalCorrection
-from tests.physics.soft.oracles.tangential import TangentialCorrection
 from raytac.physics.soft.mesh import PadMesh
 from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
 from raytac.shapes.part import Part, mesh_part
 from raytac.shapes.underside import object_height
 from raytac.specs.sensor import GelpadSpec
+from tests.physics.soft.oracles.coat_surface import BarrierClearance, CoatPlaces, CoatSurface
+from tests.physics.soft.oracles.normal import ContactSampler, NormalCorrection
+from tests.physics.soft.oracles.tangential import TangentialCorrection
 
 _SAMPLE = 0.2e-3
 """Spacing of the samples at which the clearance is measured [m]."""

@@ -12,8 +12,8 @@ from raytac.gel.interpolate import sampled
 from raytac.gel.matmul import product, sandwich
 from raytac.physics.bonded_layer import layer_shear, layer_spread
 from raytac.physics.soft.correction.cosine_series import CosineSeries
-from tests.physics.soft.oracles.normal import NormalContact, NormalCorrection
 from raytac.specs.sensor import GelpadSpec
+from tests.physics.soft.oracles.normal import NormalContact, NormalCorrection
 
 Response = Callable[[np.ndarray], np.ndarray]
 """A: displacement [m] of a traction [Pa], (2, n, m) each."""

@@ -1,0 +1,328 @@
+"""Reading of soft pads: surface, contact and forces from the solver's state, on its device."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from raytac.gel.coat_mesh import DeformedCoat
+from raytac.gel.products import Products
+from raytac.gel.surface import GelSurface, PadGrid, make_grid
+from raytac.physics.soft import reading_kernels as kernels
+from raytac.physics.soft.clearance import BarrierClearance
+from raytac.physics.soft.coat_state import CoatState
+from raytac.physics.soft.coat_surface import CoatSurface
+from raytac.physics.soft.correction import normal_kernels
+from raytac.physics.soft.correction.mesh_compliance import coat_compliance
+from raytac.physics.soft.correction.normal import ContactSampler, NormalCorrection
+from raytac.physics.soft.correction.plane_waves import node_lines
+from raytac.physics.soft.correction.tangential import TangentialCorrection
+from raytac.physics.soft.hats import hat_arrays
+from raytac.physics.soft.mesh import PadMesh
+from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
+from raytac.physics.soft.undersides import Undersides
+from raytac.specs.sensor import GelpadSpec
+from raytac.warp_runtime import LAUNCH, Recorded, start_warp
+
+_SAMPLE = 0.2e-3
+"""Spacing of the samples at which the clearance is measured [m]."""
+
+
+class UnsolvedContactWarning(UserWarning):
+    """The search for the contact below the size of a cell ended before it converged."""
+
+
+@dataclass(frozen=True)
+class SoftReading:
+    """B pads as they are shown; pad frame."""
+
+    surface: GelSurface
+    """Its ``coat`` is the height shown: the solver's vertices with the correction, if any."""
+    vertices: np.ndarray
+    """The solver's own vertices of the coat [m], shape (B, V, 3): where ``forces`` act."""
+    forces: np.ndarray
+    """Contact force on each vertex of the coat [N], shape (B, V, 3)."""
+    clearance: np.ndarray
+    """Mean distance that the barrier kept [m], shape (B,); NaN out of contact."""
+    poses: tuple[np.ndarray, ...]
+    """``pad_from_object`` (B, 4, 4) of each object, rigid ones first, lowered by the clearance."""
+    underside: np.ndarray
+    """Underside of the objects over the grid [m], (B, Ny, Nx), inf where there is none.
+
+    Rigid parts wholly above the pad's highest point may be missing."""
+    residual: np.ndarray
+    """Deepest overlap or widest gap under pressure [m], (B,), of the corrected contact.
+
+    It is taken before the coat is laid on the object; NaN out of contact, or without correction."""
+    failed: np.ndarray
+    """Environments of which nothing is shown, (B,) bool: they failed, or are not finite."""
+
+
+@dataclass(frozen=True)
+class PadArrays:
+    """B pads as they are shown, as arrays of the device; the next reading overwrites them."""
+
+    height: wp.array
+    """z of the surface, pad frame [m], (B, Ny, Nx), float32; this and the next four are NaN or 0 where ``failed``."""
+    contact: wp.array
+    """1 where an object touches, (B, Ny, Nx), uint8."""
+    centre: wp.array
+    """Mean place of the normal load [m], (B,) of ``vec2d``; NaN out of contact."""
+    coat: wp.array
+    """Vertices of the coat as they are shown [m], (B, V) of ``vec3d``."""
+    clearance: wp.array
+    """As of ``SoftReading``, (B,), float64."""
+    residual: wp.array
+    """As of ``SoftReading``, (B,), float64."""
+    underside: wp.array
+    """As of ``SoftReading``, (B, Ny, Nx), float64."""
+    vertices: wp.array
+    """The solver's own vertices of the coat [m], (B, V) of ``vec3d``."""
+    forces: wp.array
+    """Contact force on each of them [N], (B, V) of ``vec3d``."""
+    failed: wp.array
+    """Environments of which nothing is shown, (B,), bool."""
+
+
+class SoftReader:
+    """Reads one kind of pad, whatever touches it: one object or several, rigid or soft.
+
+    All environments are read at once, by kernels on the device that holds their state.
+    """
+
+    def __init__(
+        self, mesh: PadMesh, gelpad: GelpadSpec, grid: PadGrid, correction: Correction | None = DEFAULT_CORRECTION
+    ) -> None:
+        """Show surfaces on ``grid``; without ``correction`` the spline through the vertices."""
+        start_warp()
+        self.mesh, self.grid, self.correction, self._gelpad = mesh, grid, correction, gelpad
+        self._batches: dict[tuple[int, str], _Batch] = {}
+        self._warned = False
+
+    def clearance(self, state: CoatState) -> np.ndarray:
+        """Mean distance that the barrier keeps [m], shape (B,), NaN out of contact; a copy."""
+        with LAUNCH:
+            return self._batch(state).measure(state).numpy().copy()
+
+    def launch(self, state: CoatState, failed: wp.array) -> PadArrays:
+        """Read every pad on the device; nothing is copied. ``failed``: (B,), bool.
+
+        From the second reading of the same arrays on, all kernels are launched as one recording.
+        """
+        with LAUNCH:
+            batch = self._batch(state)
+            wp.copy(batch.given, failed)
+            return batch.read(state)
+
+    def read(self, state: CoatState, failed: np.ndarray) -> SoftReading:
+        """Surface, contact and forces of every pad, copied; NaN where ``failed`` (B,) or not finite."""
+        device: Any = state.vertices.device
+        shown = self.launch(state, wp.array(failed, dtype=wp.bool, device=device))
+        lost, clearance, residual, centre, coat, vertices, forces = (
+            array.numpy().copy()
+            for array in (
+                shown.failed, shown.clearance, shown.residual, shown.centre, shown.coat, shown.vertices, shown.forces,
+            )
+        )  # fmt: skip
+        height, contact, underside = (array.numpy().copy() for array in (shown.height, shown.contact, shown.underside))
+        poses, touching = state.objects.poses.numpy().copy(), state.objects.touching.numpy()
+        poses[:, :, 2, 3] -= np.nan_to_num(clearance)[:, None]
+        for values in (vertices, forces, poses):
+            values[lost] = np.nan
+        self._warn(residual)
+        pose = None
+        if poses.shape[1]:
+            first = np.where(touching.any(axis=1), touching.argmax(axis=1), 0)
+            pose = poses[np.arange(len(poses)), first]
+        surface = GelSurface(self.grid, height, contact.view(bool), centre, pose, DeformedCoat(self.mesh.coat, coat))
+        each = tuple(poses[:, k].copy() for k in range(poses.shape[1]))
+        return SoftReading(surface, vertices, forces, clearance, each, underside, residual, lost)
+
+    def _batch(self, state: CoatState) -> _Batch:
+        """Arrays for as many environments as the state has, on its device."""
+        key = len(state.vertices), str(state.vertices.device)
+        if key not in self._batches:
+            self._batches[key] = _Batch(self, *key)
+        return self._batches[key]
+
+    def _warn(self, residual: np.ndarray) -> None:
+        """Warn once of a contact that was not solved."""
+        worst = float(np.nanmax(residual, initial=0.0))
+        if self.correction is not None and worst > self.correction.unsolved and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"the contact below the size of a cell was left {1e6 * worst:.1f} µm from its solution, more than "
+                f"{1e6 * self.correction.unsolved:g} µm: the shown coat is laid on the object where it touches, and off by about so much "
+                "around it",
+                UnsolvedContactWarning,
+                stacklevel=3,
+            )
+
+    @property
+    def gelpad(self) -> GelpadSpec:
+        """Gelpad of the pads."""
+        return self._gelpad
+
+    @cached_property
+    def fine_grid(self) -> PadGrid:
+        """Grid on which contact below the size of a cell is solved."""
+        correction = self.correction
+        if correction is None or min(self.grid.pitch) > 0.9 * correction.pitch:
+            return self.grid
+        return make_grid(self._gelpad, correction.pitch)
+
+    @cached_property
+    def compliances(self) -> tuple[np.ndarray, np.ndarray]:
+        """Compliance of the mesh, and if its sides may not move outwards; they take a while."""
+        continued = coat_compliance(self.mesh, self._gelpad, rollers=True, along=(0, 1, 2))
+        return coat_compliance(self.mesh, self._gelpad)[0], continued
+
+
+class _Batch:
+    """Arrays and kernels of a reader for B pads of one device.
+
+    Attributes:
+        given: environments that are not to be read, (B,), bool.
+    """
+
+    def __init__(self, reader: SoftReader, num_envs: int, device: str) -> None:
+        mesh, grid, gelpad = reader.mesh, reader.grid, reader.gelpad
+        self._reader, self._products = reader, Products(num_envs, device)
+        products, self._device = self._products, wp.get_device(device)
+        self._surface = CoatSurface(mesh.coat, gelpad, products)
+        samples = make_grid(gelpad, max(_SAMPLE, *grid.pitch))
+        self._clearance = BarrierClearance(self._surface, samples, mesh.d_hat, products)
+        self._rows, self._columns = self._surface.matrices(grid.x, grid.y)
+        self._lattice, self._spare = (
+            products.zeros(*self._surface.lattice),
+            products.zeros(grid.shape[0], self._surface.lattice[1]),
+        )
+        self._rise, self._undersides = (
+            products.zeros(*grid.shape),
+            Undersides(grid, float(grid.rest.max()), num_envs, self._device),
+        )
+        self._rest = self._on_device(grid.rest, wp.float64)
+        self._hats, self._lines = hat_arrays(mesh.coat, grid.x, grid.y, self._device), node_lines(grid.x, grid.y)
+        vertices = len(mesh.coat.rest)
+        self._sound, self._load = self._zeros(num_envs, dtype=wp.int32), self._zeros(num_envs, vertices, dtype=wp.float64)
+        self._solved, self._none = self._zeros(0, dtype=wp.float64), self._zeros(num_envs, dtype=wp.bool)
+        self._height, self._contact = (self._zeros(num_envs, *grid.shape, dtype=dtype) for dtype in (wp.float32, wp.uint8))
+        self._above = self._zeros(num_envs, *grid.shape, dtype=wp.float32)
+        self._coat, self._centre = self._zeros(num_envs, vertices, dtype=wp.vec3d), self._zeros(num_envs, dtype=wp.vec2d)
+        self.given = self._zeros(num_envs, dtype=wp.bool)
+        self._state: CoatState | None = None
+        self._recorded: Recorded | None = None
+        self._shown: Any = None
+        self._residual, self._failed = self._zeros(num_envs, dtype=wp.float64), self._zeros(num_envs, dtype=wp.bool)
+
+    def measure(self, state: CoatState) -> wp.array:
+        """Launch the clearance [m], (B,)."""
+        self._find_sound(state, self._none)
+        return self._measure(state)
+
+    def read(self, state: CoatState) -> PadArrays:
+        """Show a state but for the environments ``given`` as failed."""
+        if self._state is not state:
+            self._state, self._recorded = state, None
+            self._shown = self._launch_all(state)
+            return self._shown
+        if self._recorded is None:
+            self._recorded = Recorded(partial(self._launch_all, state), device=self._device)
+        self._recorded()
+        return self._shown
+
+    def _launch_all(self, state: CoatState) -> PadArrays:
+        """Launch all that is shown."""
+        correction, sound = self._reader.correction, self._sound
+        lines, under = self._height.shape[:2], self._undersides
+        self._find_sound(state, self.given)
+        clearance = self._measure(state)
+        self._surface.rise(self._lattice)
+        self._products.sandwich(self._rows, self._lattice, self._columns, self._spare, self._rise)
+        under.find(state.objects, sound, clearance)
+        under.remove_behind(state.objects, self._rise.numbers, clearance)
+        if correction is None:
+            self._launch(normal_kernels.loads, self._load.shape, [sound, state.forces, clearance, self._load])
+            fields = [self._load, clearance, self._rest, self._rise.numbers, under.under, self._height, self._contact]
+            columns, d_hat = self._reader.mesh.coat.shape[1], self._reader.mesh.d_hat
+            self._launch(kernels.show_plain, lines, [self._hats, columns, d_hat, *fields])
+            wp.copy(self._coat, state.vertices)
+        else:
+            self._correct(state, clearance, correction)
+        self._launch(kernels.find_centres, len(sound), [sound, clearance, state.forces, state.vertices, self._centre])
+        self._launch(kernels.lose_heights, lines, [self._height, sound])
+        self._launch(kernels.find_sound_surfaces, self._coat.shape, [self._coat, sound])
+        self._launch(kernels.hide_nodes, lines, [sound, self._height, self._contact, under.under])
+        hidden = [self._coat, clearance, self._centre, self._residual, self._failed]
+        self._launch(kernels.hide_coats, len(sound), [sound, self._solved, *hidden])
+        return PadArrays(
+            self._height, self._contact, self._centre, self._coat, clearance, self._residual, under.under, state.vertices,
+            state.forces, self._failed,
+        )  # fmt: skip
+
+    def _find_sound(self, state: CoatState, failed: wp.array) -> None:
+        objects = state.objects
+        arrays = [failed, state.vertices, state.forces, objects.poses, self._sound]
+        self._launch(kernels.find_sound, len(self._sound), arrays)
+        for vertices, _ in objects.surfaces:
+            self._launch(kernels.find_sound_surfaces, vertices.shape, [vertices, self._sound])
+
+    def _measure(self, state: CoatState) -> wp.array:
+        self._surface.place(state.vertices, self._sound)
+        self._clearance.measure(state.forces, state.objects, self._sound)
+        return self._clearance.clearance
+
+    def _correct(self, state: CoatState, clearance: wp.array, correction: Correction) -> None:
+        """Launch the correction of height, contact and coat."""
+        normal, sampler, tangential, fine = self._stages
+        rise, sound, lines = self._rise.numbers, self._sound, self._height.shape[:2]
+        under = self._undersides.under
+        if fine is not None:
+            finer, rows, columns, lattice, risen = fine
+            self._products.sandwich(rows, self._lattice, columns, lattice, risen)
+            finer.find(state.objects, sound, clearance)
+            finer.remove_behind(state.objects, risen.numbers, clearance)
+            under = finer.under
+        normal.solve(state.forces, clearance, sound, under)
+        self._solved = normal.search.best
+        self._products.sandwich(self._rows, normal.rise, self._columns, self._spare, self._other)
+        laid = [int(correction.normal), correction.closed_gap, clearance, *sampler.nearest, normal.pressure.numbers, self._rest]
+        fields = [rise, self._other.numbers, sampler.dent(normal).numbers, self._undersides.under, self._height, self._contact]
+        self._launch(normal_kernels.lay, lines, [*laid, *fields])
+        tangential.correct(state.objects)
+        self._launch(kernels.above_rest, lines, [self._height, self._rest, self._above])
+        placed = [clearance, tangential.displacement, self._lines, self._above, state.vertices, self._coat]
+        self._launch(kernels.place_coat, self._coat.shape, [self._surface.struct, *placed])
+
+    @cached_property
+    def _stages(self) -> tuple[NormalCorrection, ContactSampler, TangentialCorrection, Any]:
+        """Stages of the correction, and what the fine grid needs if it is not the grid itself."""
+        reader, products = self._reader, self._products
+        assert reader.correction is not None
+        grid, (compliance, continued) = reader.fine_grid, reader.compliances
+        normal = NormalCorrection(self._surface, reader.gelpad, grid, compliance[2], continued[2, 2], reader.correction, products)
+        tangential = TangentialCorrection(normal, reader.gelpad, compliance, continued)
+        fine = None
+        if grid is not reader.grid:
+            undersides = Undersides(grid, float(grid.rest.max()), products.num_envs, self._device)
+            lattice = products.zeros(grid.shape[0], self._surface.lattice[1])
+            fine = undersides, *self._surface.matrices(grid.x, grid.y), lattice, products.zeros(*grid.shape)
+        return normal, ContactSampler(normal, reader.grid.x, reader.grid.y), tangential, fine
+
+    @cached_property
+    def _other(self) -> Any:
+        return self._products.zeros(*self._reader.grid.shape)
+
+    def _on_device(self, values: np.ndarray, dtype: Any) -> wp.array:
+        return wp.array(values, dtype=dtype, device=self._device)
+
+    def _zeros(self, *shape: int, dtype: Any) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device=self._device)
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, device=self._device)
