@@ -53,6 +53,32 @@ def test_the_sensor_reads_the_soft_pad(resting: TactileWorld) -> None:
     assert frame.surface.grid.shape == resting.sensors["sensor"].grid.shape
 
 
+def test_a_soft_pad_gives_arrays_of_its_device_without_copies() -> None:
+    """What ``read`` has is what ``observe`` shows, in memory that other libraries share and the next reading overwrites."""
+    dotted = replace(UP, robot=RobotSpec("fixed_sensor", "gelsight_mini_7x9"))
+    world = TactileWorld(dotted, outputs=("height", "wrench", "traction"), markers="surface", num_envs=2, device="cpu")
+    for _ in range(3):
+        world.step()
+    frame = world.read("sensor")
+    arrays, seen = frame.numpy(), world.observe()["sensor"]
+    assert set(arrays) == {"wrench", "active", "height", "contact", "markers", "traction"} and arrays["active"].all()
+    np.testing.assert_array_equal(arrays["height"], seen.height)
+    np.testing.assert_array_equal(arrays["contact"].astype(bool), seen.surface.contact)
+    np.testing.assert_array_equal(arrays["wrench"], seen.wrench)
+    np.testing.assert_array_equal(arrays["traction"], seen.traction)
+    assert np.abs(arrays["wrench"][:, 2]).min() > 0.1 and arrays["contact"].any(axis=(1, 2)).all()
+    assert frame.height is not None
+    tracked = seen.markers.displacement[..., :2]
+    assert np.abs(arrays["markers"] - tracked).max() < 1e-9 and np.abs(tracked).max() > 1e-6
+    heights = np.from_dlpack(frame.height)
+    before = heights.copy()
+    world.reset()
+    world.read("sensor")
+    assert np.abs(heights - before).max() > 1e-5  # the same memory, after a reset
+    with pytest.raises(InputError, match=r"sensor = 'finger'.*sensor of the world"):
+        world.read("finger")
+
+
 def test_some_environments_read_as_all_of_them_do() -> None:
     world = TactileWorld(UP, outputs=("wrench", "traction"), num_envs=2)
     for _ in range(3):

@@ -10,11 +10,11 @@ import numpy as np
 
 from raytac.errors import InputError, SpecError
 from raytac.gel.surface import GelSurface
-from raytac.gel.traction import CoatTraction
 from raytac.io.progress import Progress
 from raytac.physics.base import PadReading
 from raytac.physics.press import CLEARANCE, PressPad, PressSettings
 from raytac.physics.soft.bodies import object_body
+from raytac.physics.soft.coat_points import CoatTraction
 from raytac.physics.soft.coat_state import CoatState
 from raytac.physics.soft.mesh import PadMesh, pad_mesh
 from raytac.physics.soft.placement import PressPlacement

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike
 
 import ipc
@@ -16,7 +17,7 @@ from raytac.gel.surface import PadGrid, chosen_envs, make_grid
 from raytac.physics.soft.bodies import SceneBody, ScenePad, SceneRegistry, pad_body
 from raytac.physics.soft.coat_state import CoatState, SceneCoat
 from raytac.physics.soft.mesh import pad_stiffness
-from raytac.physics.soft.reading import SoftReader, SoftReading
+from raytac.physics.soft.reading import PadArrays, SoftReader, SoftReading
 from raytac.physics.soft.scene_state import Poses, SceneReport, SceneState
 from raytac.physics.soft.settings import SceneSettings
 from raytac.physics.soft.substeps import Substeps
@@ -260,11 +261,21 @@ class SoftScene:
 
     def reading(self, pad: str, grid: PadGrid | None = None, failed: np.ndarray | None = None) -> SoftReading:
         """Surface, contact, forces of a pad on its own grid or another; NaN where ``failed`` (B,)."""
+        reader, lost = self._reader(pad, grid), self._failed if failed is None else self._failed | failed
+        return reader.read(self.coat_state(pad), lost)
+
+    def arrays(self, pad: str, grid: PadGrid | None = None, failed: np.ndarray | None = None) -> PadArrays:
+        """As ``reading``, but arrays of the device that the next reading overwrites: no copies."""
+        lost = self._failed if failed is None else self._failed | failed
+        given = wp.array(lost, dtype=wp.bool, device=self.world.device)
+        return self._reader(pad, grid).launch(self.coat_state(pad), given)
+
+    def _reader(self, pad: str, grid: PadGrid | None) -> SoftReader:
         scene_pad = self._registry.pad(pad)
         if pad not in self._readers or (grid is not None and grid is not self._readers[pad].grid):
             mesh = replace(scene_pad.mesh, d_hat=self.world.d_hat)
             self._readers[pad] = SoftReader(mesh, scene_pad.sensor.gelpad, grid or self.grid(pad), scene_pad.correction)
-        return self._readers[pad].read(self.coat_state(pad), self._failed if failed is None else self._failed | failed)
+        return self._readers[pad]
 
     def coat_state(self, pad: str) -> CoatState:
         """A pad's coat with the forces on it, and the objects that it touches, on the device.

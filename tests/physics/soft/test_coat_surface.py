@@ -10,7 +10,8 @@ from raytac.errors import InputError
 from raytac.gel.coat_mesh import CoatMesh, DeformedCoat
 from raytac.gel.interpolate import SplineAxis, hat_matrix
 from raytac.gel.surface import make_grid, rest_height
-from raytac.gel.traction import CoatTraction, cell_areas, foundation_traction
+from raytac.gel.traction import cell_areas, foundation_traction
+from raytac.physics.soft.coat_points import CoatTraction
 from raytac.physics.soft.mesh import pad_mesh
 from raytac.specs import load_sensor
 from tests.physics.soft.oracles.coat_surface import BarrierClearance, CoatSurface

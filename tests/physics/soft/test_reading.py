@@ -10,7 +10,9 @@ import pytest
 import warp as wp
 
 from raytac.gel.surface import make_grid
+from raytac.markers.surface import CoatPoints
 from raytac.physics.soft.bodies import ScenePad, scene_body
+from raytac.physics.soft.coat_points import CoatMarkers, CoatTraction
 from raytac.physics.soft.coat_state import CoatState, ContactObject
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
 from raytac.physics.soft.reading import SoftReader
@@ -19,6 +21,7 @@ from raytac.physics.soft.settings import Correction
 from raytac.shapes.part import primitive
 from raytac.specs import load_sensor
 from tests.physics.soft.oracles import reading as oracle
+from tests.physics.soft.oracles.traction import CoatTraction as OracleTraction
 
 SENSOR = load_sensor("gelsight_mini")
 GELPAD = SENSOR.gelpad
@@ -38,15 +41,10 @@ CORRECTIONS = {
 }
 
 
-def at(x, y, z, turn=np.eye(4)):
-    pose = turn.copy()
+def at(x, y, z, turn=None):
+    pose = np.eye(4) if turn is None else turn.copy()
     pose[:3, 3] = x, y, z
     return pose
-
-
-def moved(path, k):
-    """Poses of one body in three environments, at a share of their different paths."""
-    return np.stack([at(x, y, z - k * depth) for x, y, z, depth in path])
 
 
 @cache
@@ -209,3 +207,20 @@ def test_soft_bodies_affine_ones_and_other_pads_are_read_as_they_are_touched():
     seen = scene.reading("pad", GRID)
     assert seen.surface.contact[:, :, : GRID.shape[1] // 2 + 8].any() and seen.surface.contact[:, :, -40:].any()
     assert_same(seen, expected, 1e-6)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_traction_and_markers_are_those_of_numpy(device):
+    """Of random forces and displacements: the same sums of the same triangles."""
+    rng, mesh = np.random.default_rng(3), MESH.coat
+    forces, coat = rng.normal(size=(2, len(mesh.rest), 3)), mesh.rest + rng.normal(scale=1e-4, size=(2, len(mesh.rest), 3))
+    expected = OracleTraction(mesh, GRID)(forces)
+    traction = CoatTraction(mesh, GRID, device)
+    for _ in range(2):
+        assert np.allclose(traction(forces), expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
+    places = rng.uniform(-6e-3, 6e-3, size=(2, 40, 2))[0]
+    rest = np.concatenate([places, np.zeros((40, 1))], axis=1)[None]
+    tracked = CoatPoints().interpolate(mesh, np.repeat(rest, 2, axis=0), coat - mesh.rest)
+    markers = CoatMarkers(mesh, places, 2, device)
+    followed = markers.launch(wp.array(coat, dtype=wp.vec3d, device=device)).numpy()
+    assert np.abs(followed - tracked[..., :2]).max() < 1e-10 and np.abs(followed).max() > 5e-5
