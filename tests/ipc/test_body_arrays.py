@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import warp as wp
@@ -19,7 +21,7 @@ DEVICES = [
 def pressed(device: str, num_envs: int = 2) -> ipc.World:
     """A ball on a pad and a small cube beside it, after two steps in contact; the second environment is pressed deeper."""
     ball = ipc.KinematicBody("ball", ipc.icosphere(RADIUS, 2), ipc.Pose((0.0, 0.0, RADIUS + GAP)))
-    cube = ipc.AffineBody("cube", ipc.box_surface((2e-3,) * 3), pose=ipc.Pose((0.0, 0.0, 0.05)))
+    cube = ipc.AffineBody("cube", ipc.box_surface((2e-3, 2e-3, 2e-3)), pose=ipc.Pose((0.0, 0.0, 0.05)))
     floor = ipc.HalfSpace("floor", pose=ipc.Pose((0.0, 0.0, -0.1)))
     settings = ipc.Settings(dt=0.01, d_hat=1e-4, gravity=(0.0, 0.0, -9.81))
     world = ipc.World([bonded_pad(small_pad()), ball, cube, floor], settings, num_envs=num_envs, device=device)
@@ -30,7 +32,7 @@ def pressed(device: str, num_envs: int = 2) -> ipc.World:
     return world
 
 
-def shared(array: wp.array) -> np.ndarray:
+def shared(array: Any) -> Any:
     """The memory of an array of the CPU by DLPack; a copy of one on CUDA."""
     return np.from_dlpack(array) if array.device.is_cpu else array.numpy()
 
@@ -66,7 +68,8 @@ def test_memory_is_shared_and_follows_the_world() -> None:
     """An array that was asked for once has the state of every later step, and that of a reset, without a copy."""
     world = pressed("cpu")
     arrays = world.arrays("pad")
-    vertices, forces = np.from_dlpack(arrays.vertices), np.from_dlpack(arrays.forces)
+    vertices: Any = np.from_dlpack(arrays.vertices)
+    forces: Any = np.from_dlpack(arrays.forces)
     assert not vertices.flags.owndata and vertices.ctypes.data == arrays.vertices.ptr
     before = vertices.copy(), forces.copy()
     world.set_target("ball", world.frame("ball")[1] - [0.0, 0.0, 0.1e-3])

@@ -70,7 +70,7 @@ def test_a_soft_pad_gives_arrays_of_its_device_without_copies() -> None:
     assert frame.height is not None
     tracked = seen.markers.displacement[..., :2]
     assert np.abs(arrays["markers"] - tracked).max() < 1e-9 and np.abs(tracked).max() > 1e-6
-    heights = np.from_dlpack(frame.height)
+    heights: Any = np.from_dlpack(frame.height)
     before = heights.copy()
     world.reset()
     world.read("sensor")

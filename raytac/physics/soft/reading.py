@@ -123,14 +123,10 @@ class SoftReader:
         """Surface, contact and forces of every pad, copied; NaN where ``failed`` (B,) or not finite."""
         device: Any = state.vertices.device
         shown = self.launch(state, wp.array(failed, dtype=wp.bool, device=device))
-        lost, clearance, residual, centre, coat, vertices, forces = (
-            array.numpy().copy()
-            for array in (
-                shown.failed, shown.clearance, shown.residual, shown.centre, shown.coat, shown.vertices, shown.forces,
-            )
-        )  # fmt: skip
-        height, contact, underside = (array.numpy().copy() for array in (shown.height, shown.contact, shown.underside))
-        poses, touching = state.objects.poses.numpy().copy(), state.objects.touching.numpy()
+        lost, clearance, residual, centre = map(_copied, (shown.failed, shown.clearance, shown.residual, shown.centre))
+        coat, vertices, forces = map(_copied, (shown.coat, shown.vertices, shown.forces))
+        height, contact, underside = map(_copied, (shown.height, shown.contact, shown.underside))
+        poses, touching = _copied(state.objects.poses), _copied(state.objects.touching)
         poses[:, :, 2, 3] -= np.nan_to_num(clearance)[:, None]
         for values in (vertices, forces, poses):
             values[lost] = np.nan
@@ -181,6 +177,10 @@ class SoftReader:
         """Compliance of the mesh, and if its sides may not move outwards; they take a while."""
         continued = coat_compliance(self.mesh, self._gelpad, rollers=True, along=(0, 1, 2))
         return coat_compliance(self.mesh, self._gelpad)[0], continued
+
+
+def _copied(array: wp.array) -> np.ndarray:
+    return array.numpy().copy()
 
 
 class _Batch:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,7 +42,7 @@ CORRECTIONS = {
 }
 
 
-def at(x, y, z, turn=None):
+def at(x, y, z, turn=None) -> Any:
     pose = np.eye(4) if turn is None else turn.copy()
     pose[:3, 3] = x, y, z
     return pose
@@ -68,7 +69,7 @@ def pressed():
     return scene
 
 
-def in_numpy(scene):
+def in_numpy(scene) -> Any:
     """The same state by the world's copies, for the oracle and for ``CoatState.of``."""
     touching = scene.world.touching("pad")
     objects = [
@@ -89,7 +90,7 @@ def reader(correction, grid=GRID):
     return SoftReader(replace(MESH, d_hat=pressed().world.d_hat), GELPAD, grid, correction)
 
 
-def assert_same(seen, expected, sideways=1e-9):
+def assert_same(seen: Any, expected: Any, sideways=1e-9):
     """Readings agree: heights to the rounding of float32; sideways to what the oracle's own search for forces leaves."""
     assert np.array_equal(seen.failed, expected.failed)
     assert seen.surface.contact.any() and (seen.surface.contact != expected.surface.contact).mean() < 1e-4
@@ -138,11 +139,11 @@ def test_a_recording_reads_what_its_arrays_hold_now(device):
 def test_a_pad_is_read_the_same_alone_and_in_a_batch():
     """To the bit: neither other environments nor what touches there matter."""
     vertices, forces, objects = in_numpy(pressed())
-    whole = reader(CORRECTIONS["all"]).read(CoatState.of(vertices, forces, objects), np.zeros(3, bool))
+    whole: Any = reader(CORRECTIONS["all"]).read(CoatState.of(vertices, forces, objects), np.zeros(3, bool))
     alone = reader(CORRECTIONS["all"])
     for b in range(3):
         some = [replace(o, poses=o.poses[b : b + 1], touching=o.touching[b : b + 1]) for o in objects]
-        one = alone.read(CoatState.of(vertices[b : b + 1], forces[b : b + 1], some), np.zeros(1, bool))
+        one: Any = alone.read(CoatState.of(vertices[b : b + 1], forces[b : b + 1], some), np.zeros(1, bool))
         for values, expected in (
             (one.surface.height, whole.surface.height),
             (one.surface.coat.positions, whole.surface.coat.positions),
@@ -192,7 +193,7 @@ def test_soft_bodies_affine_ones_and_other_pads_are_read_as_they_are_touched():
     touching, objects = scene.world.touching("pad"), []
     assert touching["ball"].all() and touching["cube"].all()
     for name, mask in touching.items():
-        body = scene.bodies.get(name)
+        body: Any = scene.bodies.get(name)
         soft = body is None or body.is_soft
         surface = scene.skin(name, "pad") if soft else None
         parts = () if soft else body.parts

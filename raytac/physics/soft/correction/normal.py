@@ -240,7 +240,8 @@ class NormalCorrection:
         distance = np.arange(2 * nodes - 1)
         cosines = np.cos(np.pi * np.outer(np.arange(nodes), distance) / (nodes - 1))
         table = self.products.constant((cosines.T * (half / (nodes - 1))) @ layer.T)
-        return table.packets[0]
+        packets: Any = table.packets
+        return packets[0]
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.products.device)
