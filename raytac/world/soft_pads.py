@@ -49,7 +49,10 @@ _CELLS = 8
 _INSIDE = 1e-4
 """Most overlap of a body with a case or link that is not reported [m]: rounding."""
 
-_REPORT = {"min_gap": np.inf, "min_det": 1.0, "blocked": 0.0, "converged": True, "unconverged": 0, "newton": 0, "substeps": 0}
+_REPORT = {
+    **{"min_gap": np.inf, "min_det": 1.0, "blocked": 0.0, "converged": True},
+    **{"unconverged": 0, "newton": 0, "linear": 0, "substeps": 0},
+}
 """Fields of ``SceneReport`` that a world reports, and their values before any step."""
 
 
@@ -163,7 +166,7 @@ class SoftPads:
         Raises ``InputError``: the only environment moves too fast; it has failed then, until it is reset.
         """
         scene, timestep, datas = self._scene, self.composed.timestep, self._datas
-        interval, since, reports = round(scene.soft_timestep / timestep), 0, []
+        interval, since, reports = round(scene.soft_timestep / timestep), np.zeros(len(datas), int), []
         steps = round(scene.control_timestep / timestep)
         for step in range(1, steps + 1):
             for b, data in enumerate(datas):
@@ -172,15 +175,12 @@ class SoftPads:
             since += 1
             cases, driven = self._now(datas, failed)
             # Before a contact begins, the solver steps early, so that MuJoCo has the contact's force before the bodies overlap far.
-            early = (
-                self._coupling is not None
-                and since < interval
-                and step < steps
-                and not self.soft.is_small(cases, driven, since * timestep)
-            )
-            if since == interval or step == steps or early:
-                reports.append(self._follow(datas, failed, cases, driven, since * timestep))
-                since = 0
+            due = (since == interval) | (step == steps)
+            if self._coupling is not None and not due.all():
+                due |= ~self.soft.is_small(cases, driven, since * timestep)
+            if due.any():
+                reports.append(self._follow(datas, failed, cases, driven, since * timestep, due))
+                since[due] = 0
         whole = reduce(SceneReport.then, reports)
         failed |= ~whole.last_converged
         if (failed & ~self.soft.failed).any():
@@ -275,17 +275,25 @@ class SoftPads:
         return cases, {name: np.where(failed[:, None, None], self._last_driven[name], pose) for name, pose in now.items()}
 
     def _follow(
-        self, datas: Sequence[mujoco.MjData], failed: np.ndarray, cases: np.ndarray, driven: dict[str, np.ndarray], dt: float
+        self,
+        datas: Sequence[mujoco.MjData],
+        failed: np.ndarray,
+        cases: np.ndarray,
+        driven: dict[str, np.ndarray],
+        dt: np.ndarray,
+        due: np.ndarray,
     ) -> SceneReport:
-        """Step the solver to MuJoCo's present poses."""
+        """Step the solver by ``dt`` (B,) [s] to MuJoCo's poses, in environments ``due`` (B,)."""
         try:
-            report = self.soft.step(cases, driven, dt)
+            report = self.soft.step(cases, driven, dt, due)
         except InputError:
             failed[:] = True  # MuJoCo is ahead of the solver
             raise
-        self._last_cases, self._last_driven = cases, driven
+        self._last_cases[due] = cases[due]
+        for name, pose in driven.items():
+            self._last_driven[name][due] = pose[due]
         failed |= report.failed
-        alive = np.flatnonzero(~failed).tolist()
+        alive = np.flatnonzero(due & ~failed).tolist()
         self._mirror(datas, alive)
         if self._coupling is not None:
             inputs = coupling_inputs(self.soft, self._felt)
@@ -296,7 +304,7 @@ class SoftPads:
         for k, mounted in enumerate(self.composed.sensors):
             turn, world = cases[:, k, :3, :3], self.soft.wrench(mounted.name)
             split = [np.einsum("bji,bj->bi", turn, world[:, at : at + 3]) for at in (0, 3)]
-            self._wrench[mounted.name] = np.concatenate(split, axis=1)
+            self._wrench[mounted.name][due] = np.concatenate(split, axis=1)[due]
         return report
 
     def _mirror(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray) -> None:
