@@ -32,6 +32,7 @@ from ipc.meshes import (
     graded,
     grid_blocks,
     icosphere,
+    patch_blocks,
     surface_of,
     tetrahedralize,
 )
@@ -78,6 +79,7 @@ __all__ = [
     "graded",
     "grid_blocks",
     "icosphere",
+    "patch_blocks",
     "rotation_matrix",
     "start_warp",
     "surface_of",
