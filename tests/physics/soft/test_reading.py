@@ -49,7 +49,7 @@ def at(x, y, z, turn=None) -> Any:
 
 
 @cache
-def pressed():
+def pressed(device="cpu"):
     """A ball and a turned box on a pad in three environments, sheared in the last; the second box stays away."""
     bodies = [
         scene_body("ball", (primitive("sphere", (3e-3,)),), "kinematic", friction=0.6),
@@ -59,7 +59,9 @@ def pressed():
     start = {
         name: np.stack([at(*p, turn) for p in places]) for name, places, turn in (("ball", ball, np.eye(4)), ("box", box, TURNED))
     }
-    scene = SoftScene([ScenePad("pad", SENSOR, MESH)], bodies, np.eye(4)[None], start, num_envs=3, gravity=(0.0, 0.0, 0.0))
+    scene = SoftScene(
+        [ScenePad("pad", SENSOR, MESH)], bodies, np.eye(4)[None], start, num_envs=3, gravity=(0.0, 0.0, 0.0), device=device
+    )
     for k in range(1, 6):
         goal = {name: pose.copy() for name, pose in start.items()}
         goal["ball"][:, 2, 3] -= np.array([0.08e-3, 0.1e-3, 0.12e-3]) * k
@@ -152,9 +154,10 @@ def test_a_pad_is_read_the_same_alone_and_in_a_batch():
             assert np.array_equal(values[0], expected[b])
 
 
-def test_the_state_is_read_from_the_arrays_of_the_world():
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_state_is_read_from_the_arrays_of_the_world(device):
     """Coat, forces, poses and touching objects in the pad's frame, without NumPy, are those of the scene's own methods."""
-    scene = pressed()
+    scene = pressed(device)
     vertices, forces, objects = in_numpy(scene)
     state = scene.coat_state("pad")
     assert np.abs(state.vertices.numpy() - vertices).max() < 1e-15 and np.abs(state.forces.numpy() - forces).max() < 1e-12

@@ -8,9 +8,9 @@ import numpy as np
 
 from raytac.gel.coat_mesh import CoatMesh
 from raytac.gel.interpolate import SplineAxis, cell_lengths, hat_matrix
-from raytac.gel.matmul import sandwich
 from raytac.gel.surface import rest_height
 from raytac.specs.sensor import GelpadSpec
+from tests.physics.soft.oracles.matmul import sandwich
 
 _FINER = 3
 """Cells of the lattice to one cell of the coat."""

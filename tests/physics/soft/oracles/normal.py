@@ -8,12 +8,12 @@ import numpy as np
 
 from raytac.gel.components import span
 from raytac.gel.interpolate import SplineAxis, hat_matrix
-from raytac.gel.matmul import product, sandwich
 from raytac.physics.soft.correction.cosine_series import CosineSeries
 from raytac.physics.soft.correction.nodal_compliance import nodal_compliance
 from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
 from raytac.specs.sensor import GelpadSpec
 from tests.physics.soft.oracles.coat_surface import CoatPlaces, CoatSurface
+from tests.physics.soft.oracles.matmul import product, sandwich
 
 _SHORTEST = 0.5
 """c of ``_stiffen``, in units of the grid: the fewest steps of the solver for pins, a coin and a gear."""

@@ -11,7 +11,6 @@ import numpy as np
 
 from raytac.gel.coat_mesh import DeformedCoat
 from raytac.gel.interpolate import hat_matrix, sampled
-from raytac.gel.matmul import sandwich
 from raytac.gel.surface import GelSurface, PadGrid, make_grid, rest_height
 from raytac.physics.soft.correction.mesh_compliance import coat_compliance
 from raytac.physics.soft.mesh import PadMesh
@@ -20,6 +19,7 @@ from raytac.shapes.part import Part, mesh_part
 from raytac.shapes.underside import object_height
 from raytac.specs.sensor import GelpadSpec
 from tests.physics.soft.oracles.coat_surface import BarrierClearance, CoatPlaces, CoatSurface
+from tests.physics.soft.oracles.matmul import sandwich
 from tests.physics.soft.oracles.normal import ContactSampler, NormalCorrection
 from tests.physics.soft.oracles.tangential import TangentialCorrection
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from raytac.gel.components import span
 from raytac.gel.interpolate import sampled
-from raytac.gel.matmul import product, sandwich
 from raytac.physics.bonded_layer import layer_shear, layer_spread
 from raytac.physics.soft.correction.cosine_series import CosineSeries
 from raytac.specs.sensor import GelpadSpec
+from tests.physics.soft.oracles.matmul import product, sandwich
 from tests.physics.soft.oracles.normal import NormalContact, NormalCorrection
 
 Response = Callable[[np.ndarray], np.ndarray]
