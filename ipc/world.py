@@ -246,7 +246,10 @@ class World:
         return self._arrays.body(self._index(name))
 
     def contact_arrays(self) -> ContactArrays:
-        """All contact pairs as arrays of the device; ask again after a step, which may make more room."""
+        """All contact pairs as arrays of the device.
+
+        Ask again after a step, which may make more room.
+        """
         return self._arrays.contacts()
 
     def frame(self, name: str) -> tuple[Floats, Floats]:

@@ -22,7 +22,9 @@ ROWS = 4
 CPU_LANES, CUDA_LANES = 16, 4
 """Numbers in a packet: two vector registers of AVX2, one load of CUDA."""
 PACKETS = {lanes: wp.types.vector(length=lanes, dtype=wp.float32) for lanes in (CPU_LANES, CUDA_LANES)}
-"""Types of packets; kernels for both are compiled together, since a recording does not outlive its module."""
+"""Types of packets.
+
+Kernels for both are compiled together, since a recording does not outlive its module."""
 
 
 @wp.kernel
@@ -38,8 +40,9 @@ def multiply(
     # outputs
     out: wp.array3d(dtype=Any),
 ):
-    """Σ_k left[j, k] right[k, p] over the ``inner`` k, of ``ROWS`` rows j, by (environment, block of rows, thread).
+    """Σ_k left[j, k] right[k, p] over the ``inner`` k, of ``ROWS`` rows j.
 
+    By (environment, block of rows, thread).
     ``left`` or ``right`` may have one matrix for all environments. ``rows``, ``inner``, ``columns``: from and to, of each environment;
     at least these rows and columns of ``out`` are written. ``adds``: 1 to add to what is there.
     """

@@ -27,12 +27,15 @@ class Matrices:
 
     @property
     def transposed(self) -> wp.array:
-        """The padded matrices, rows and columns exchanged, in the same memory: for the left of a product."""
+        """The padded matrices with rows and columns exchanged, in the same memory.
+
+        They are for the left of a product.
+        """
         return self.padded.transpose((0, 2, 1))
 
 
 class Products:
-    """Makes matrices for one device and multiplies them; ``left`` or ``right`` may be common to all."""
+    """Makes matrices for one device and multiplies them; one may be common to all."""
 
     def __init__(self, num_envs: int, device: Any) -> None:
         start_warp()
@@ -51,7 +54,7 @@ class Products:
         return self._matrices(np.asarray(matrix, np.float32)[None])
 
     def blocks(self, field: Matrices) -> tuple[int, int, int]:
-        """Threads of a kernel that computes ``ROWS`` rows of packets together, and how many share a row."""
+        """Threads of a kernel that computes ``ROWS`` rows together, and how many share a row."""
         count, lines, packets = field.packets.shape
         return count, lines // kernels.ROWS, 1 if self.device.is_cpu else packets
 
@@ -102,6 +105,9 @@ class Products:
         )
 
     def sandwich(self, left: Matrices, core: Matrices, right: Matrices, spare: Matrices, out: Matrices) -> None:
-        """Launch out = left @ core @ right; ``spare`` (rows of left, columns of core) is overwritten."""
+        """Launch out = left @ core @ right.
+
+        ``spare`` (rows of left, columns of core) is overwritten.
+        """
         self.multiply(left, core, spare)
         self.multiply(spare, right, out)

@@ -35,7 +35,7 @@ class WarpFrame:
     markers: wp.array | None = None
     """Displacements of the markers along x, y [m], (B, M, 2), float32."""
     traction: wp.array | None = None
-    """Force on the pad's surface per area at rest, pad frame [Pa], (B, Ny, Nx, 3), float32; soft pads."""
+    """Force per area at rest on a soft pad, pad frame [Pa], (B, Ny, Nx, 3), float32."""
 
     def torch(self) -> dict[str, torch.Tensor]:
         """Tensors by name, which share the arrays' memory. Raises ``InputError`` without PyTorch."""

@@ -1,4 +1,4 @@
-"""The clearance that the barrier keeps between a coat and an object."""
+"""The clearance that the barrier keeps between a coat and an object, at samples of both."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from raytac.gel.interpolate import cell_lengths
+from raytac.gel.coat_mesh import CoatMesh
+from raytac.gel.interpolate import SplineAxis, cell_lengths
 from raytac.gel.products import Products
 from raytac.gel.surface import PadGrid
 from raytac.physics.soft import clearance_kernels as kernels
 from raytac.physics.soft.coat_surface import CoatSurface
-from raytac.physics.soft.hats import hat_arrays
 from raytac.physics.soft.undersides import Touched, Undersides
 
 _SLACK = 1.0 / 64.0
@@ -54,9 +54,9 @@ class BarrierClearance:
         self._unmoved = wp.zeros(count, dtype=wp.float64, device=device)
 
     def measure(self, forces: wp.array, objects: Touched, sound: wp.array) -> None:
-        """Launch the measurement under ``forces`` (B, V) of ``vec3d`` [N], after the surface's ``place``.
+        """Launch the measurement under ``forces``, after the surface's ``place``.
 
-        ``sound``: 1 in environments (B,), int32, that are read.
+        ``forces``: (B, V) of ``vec3d`` [N]; ``sound``: 1 in environments (B,), int32, that are read.
         """
         columns, under = self._surface.mesh.shape[1], self.undersides.under
         self._surface.rise(self._lattice)
@@ -73,3 +73,23 @@ class BarrierClearance:
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, device=self._device)
+
+
+def hat_arrays(mesh: CoatMesh, x: np.ndarray, y: np.ndarray, device: Any) -> Any:
+    """Arrays of ``Hats`` for the lines ``x`` (Nx,), ``y`` (Ny,) [m] of a grid, evenly spaced."""
+    hats: Any = kernels.Hats()
+    for axis, lines, nodes in (("x", mesh.lines_x, x), ("y", mesh.lines_y, y)):
+        cell, (_, share, _, _) = SplineAxis(lines).weights(nodes)
+        used = (np.abs(np.arange(len(lines))[:, None] - cell - 0.5) < 1.0) & np.ones(len(nodes), bool)
+        around = np.stack([used.argmax(axis=1), len(nodes) - used[:, ::-1].argmax(axis=1)], axis=1)
+        around[~used.any(axis=1)] = 0
+        length = np.full(len(nodes), nodes[1] - nodes[0])
+        length[[0, -1]] *= 0.5
+        for name, values, dtype in (
+            ("cell", cell, wp.int32),
+            ("share", share, wp.float64),
+            ("around", around, wp.vec2i),
+            ("area", length, wp.float64),
+        ):
+            setattr(hats, f"{name}_{axis}", wp.array(values, dtype=dtype, device=device))
+    return hats

@@ -1,4 +1,4 @@
-"""Kernels of ``BarrierClearance``: mean gap under pressure between a coat and what it touches."""
+"""Kernels of ``BarrierClearance``: mean gap under pressure of a coat."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false

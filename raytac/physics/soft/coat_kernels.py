@@ -1,4 +1,4 @@
-"""Kernels of ``CoatSurface``: splines through a coat's vertices, and the material points at places."""
+"""Kernels of ``CoatSurface``: splines through vertices, and material points at places."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -125,7 +125,7 @@ def displacements(
 
 @wp.kernel
 def bend_rows(coat: Coat, values: wp.array3d(dtype=wp.float64), fields: wp.array4d(dtype=wp.float64)):
-    """Values (B, C, V) and their second derivatives along x, to ``fields`` (B, C, 4, V), 0 and 1."""
+    """Values (B, C, V) and second derivatives along x, to ``fields`` (B, C, 4, V), 0 and 1."""
     env, c, v = wp.tid()
     columns = coat.lines_x.shape[0]
     first, i = (v // columns) * columns, v % columns

@@ -1,4 +1,9 @@
-"""Traction on a soft pad's grid and motion of its markers, of B pads, on the solver's device."""
+"""Traction on the grid of soft pads and motion of their markers, on the solver's device."""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportAttributeAccessIssue=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 
@@ -11,7 +16,60 @@ from raytac.errors import InputError
 from raytac.gel.coat_mesh import CoatMesh, bind_to_coat
 from raytac.gel.surface import PadGrid
 from raytac.gel.traction import cell_areas
-from raytac.physics.soft import coat_point_kernels as kernels
+
+wp.set_module_options({"enable_backward": False, "fast_math": False})
+
+
+@wp.struct
+class Points:
+    """Points of triangles of a coat, P of them."""
+
+    corner: wp.array(dtype=wp.vec3i)
+    """Vertices of the triangle."""
+    weight: wp.array(dtype=wp.vec3d)
+    """Barycentric weights."""
+
+
+@wp.struct
+class Rows:
+    """A sparse matrix over the vertices, by rows."""
+
+    start: wp.array(dtype=wp.int32)
+    column: wp.array(dtype=wp.int32)
+    weight: wp.array(dtype=wp.float64)
+
+
+@wp.kernel
+def smooth(rows: Rows, forces: wp.array2d(dtype=wp.vec3d), out: wp.array2d(dtype=wp.vec3d)):
+    """Matrix times forces (B, V), by (environment, vertex)."""
+    env, v = wp.tid()
+    total = wp.vec3d()
+    for k in range(rows.start[v], rows.start[v + 1]):
+        total += rows.weight[k] * forces[env, rows.column[k]]
+    out[env, v] = total
+
+
+@wp.func
+def at_point(points: Points, values: wp.array2d(dtype=wp.vec3d), env: wp.int32, i: wp.int32) -> wp.vec3d:
+    corner, weight = points.corner[i], points.weight[i]
+    return weight[0] * values[env, corner[0]] + weight[1] * values[env, corner[1]] + weight[2] * values[env, corner[2]]
+
+
+@wp.kernel
+def spread(points: Points, values: wp.array2d(dtype=wp.vec3d), out: wp.array3d(dtype=wp.vec3f)):
+    """Values of vertices (B, V) at the nodes of a grid, by (environment, row)."""
+    env, row = wp.tid()
+    for i in range(out.shape[2]):
+        value = at_point(points, values, env, row * out.shape[2] + i)
+        out[env, row, i] = wp.vec3f(wp.float32(value[0]), wp.float32(value[1]), wp.float32(value[2]))
+
+
+@wp.kernel
+def follow(points: Points, rest: wp.array2d(dtype=wp.vec3d), coat: wp.array2d(dtype=wp.vec3d), out: wp.array2d(dtype=wp.vec2f)):
+    """Displacements along x and y of points, by (environment, point); ``rest``: (1, V)."""
+    env, i = wp.tid()
+    moved = at_point(points, coat, env, i) - at_point(points, rest, 0, i)
+    out[env, i] = wp.vec2f(wp.float32(moved[0]), wp.float32(moved[1]))
 
 
 class CoatTraction:
@@ -48,8 +106,8 @@ class CoatTraction:
         if self._out is None or len(self._out) != count:
             self._at_vertices = wp.zeros_like(forces)
             self._out = wp.zeros((count, *self._shape), dtype=wp.vec3f, device=self._device)
-        self._launch(kernels.smooth, forces.shape, [self._rows, forces, self._at_vertices])
-        self._launch(kernels.spread, self._out.shape[:2], [self._points, self._at_vertices, self._out])
+        self._launch(smooth, forces.shape, [self._rows, forces, self._at_vertices])
+        self._launch(spread, self._out.shape[:2], [self._points, self._at_vertices, self._out])
         return self._out
 
     def __call__(self, forces: np.ndarray) -> np.ndarray:
@@ -71,9 +129,9 @@ class CoatMarkers:
         """Along x and y [m], (B, M) of ``vec2f``, of the last ``launch``."""
 
     def launch(self, coat: wp.array) -> wp.array:
-        """Launch ``displacement`` for vertices of the coat (B, V) of ``vec3d`` [m], as they are shown."""
+        """Launch ``displacement`` for the coat (B, V) of ``vec3d`` [m], as it is shown."""
         inputs = [self._points, self._rest, coat, self.displacement]
-        wp.launch(kernels.follow, dim=self.displacement.shape, inputs=inputs, device=self.displacement.device)
+        wp.launch(follow, dim=self.displacement.shape, inputs=inputs, device=self.displacement.device)
         return self.displacement
 
 
@@ -88,7 +146,7 @@ def _averaging(mesh: CoatMesh) -> np.ndarray:
 
 def _rows(matrix: np.ndarray, device: Any) -> Any:
     row, column = np.nonzero(matrix)
-    rows: Any = kernels.Rows()
+    rows: Any = Rows()
     rows.start = wp.array(np.searchsorted(row, np.arange(len(matrix) + 1)), dtype=wp.int32, device=device)
     rows.column = wp.array(column, dtype=wp.int32, device=device)
     rows.weight = wp.array(matrix[row, column], dtype=wp.float64, device=device)
@@ -96,7 +154,7 @@ def _rows(matrix: np.ndarray, device: Any) -> Any:
 
 
 def _points(corner: np.ndarray, weight: np.ndarray, device: Any) -> Any:
-    points: Any = kernels.Points()
+    points: Any = Points()
     points.corner = wp.array(corner, dtype=wp.vec3i, device=device)
     points.weight = wp.array(weight, dtype=wp.vec3d, device=device)
     return points

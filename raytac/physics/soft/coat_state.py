@@ -1,4 +1,4 @@
-"""State of B copies of one pad's coat and of what touches it, as arrays of the solver's device."""
+"""State of B copies of one pad's coat and of what touches it, on the solver's device."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class CoatState:
         return cls(wp.array(vertices, dtype=wp.vec3d, device=device), wp.array(forces, dtype=wp.vec3d, device=device), touched)
 
     def update(self, vertices: np.ndarray, forces: np.ndarray, poses: np.ndarray, surface: np.ndarray | None = None) -> None:
-        """Write the present state of a pad with one object that touches it, from NumPy, as of ``of``."""
+        """Write the present state of a pad with one object, from NumPy, as of ``of``."""
         self.vertices.assign(vertices)
         self.forces.assign(forces)
         self.objects.poses.assign(poses[:, None])

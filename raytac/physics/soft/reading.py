@@ -14,7 +14,7 @@ from raytac.gel.coat_mesh import DeformedCoat
 from raytac.gel.products import Products
 from raytac.gel.surface import GelSurface, PadGrid, make_grid
 from raytac.physics.soft import reading_kernels as kernels
-from raytac.physics.soft.clearance import BarrierClearance
+from raytac.physics.soft.clearance import BarrierClearance, hat_arrays
 from raytac.physics.soft.coat_state import CoatState
 from raytac.physics.soft.coat_surface import CoatSurface
 from raytac.physics.soft.correction import normal_kernels
@@ -22,7 +22,6 @@ from raytac.physics.soft.correction.mesh_compliance import coat_compliance
 from raytac.physics.soft.correction.normal import ContactSampler, NormalCorrection
 from raytac.physics.soft.correction.plane_waves import node_lines
 from raytac.physics.soft.correction.tangential import TangentialCorrection
-from raytac.physics.soft.hats import hat_arrays
 from raytac.physics.soft.mesh import PadMesh
 from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
 from raytac.physics.soft.undersides import Undersides
@@ -68,7 +67,9 @@ class PadArrays:
     """B pads as they are shown, as arrays of the device; the next reading overwrites them."""
 
     height: wp.array
-    """z of the surface, pad frame [m], (B, Ny, Nx), float32; this and the next four are NaN or 0 where ``failed``."""
+    """z of the surface, pad frame [m], (B, Ny, Nx), float32.
+
+    This and the next five are NaN or 0 where ``failed``."""
     contact: wp.array
     """1 where an object touches, (B, Ny, Nx), uint8."""
     centre: wp.array

@@ -66,7 +66,7 @@ def show_plain(
     height: wp.array3d(dtype=wp.float32),
     contact: wp.array3d(dtype=wp.uint8),
 ):  # fmt: skip
-    """Height without correction along a row, and contact where vertices bear a load near the object."""
+    """Height without correction along a row, and contact where loaded vertices are near."""
     env, row = wp.tid()
     touched = wp.isfinite(clearance[env])
     for i in range(height.shape[2]):
@@ -188,7 +188,7 @@ def read_coat(
     vertices: wp.array2d(dtype=wp.vec3d),
     forces: wp.array2d(dtype=wp.vec3d),
 ):  # fmt: skip
-    """Vertices of a coat and the forces on them in the frame of the pad, from the solver's arrays."""
+    """Vertices of a coat and forces on them in the pad's frame, from the solver's arrays."""
     env, v = wp.tid()
     vertices[env, v] = nodes[env, node[v]]
     forces[env, v] = wp.transpose(rotation[env]) * surface_forces[env, vertex[v]]
@@ -200,7 +200,10 @@ def read_touching(
     # outputs
     touching: wp.array2d(dtype=wp.bool),
 ):  # fmt: skip
-    """Objects closer to a pad than d̂, by environment; ``object_of``: of each pair of bodies, −1 for none."""
+    """Objects closer to a pad than d̂, by environment.
+
+    ``object_of``: of each pair of bodies, −1 for none.
+    """
     env = wp.tid()
     for k in range(touching.shape[1]):
         touching[env, k] = False
@@ -242,9 +245,10 @@ def read_affine_pose(
     # outputs
     poses: wp.array2d(dtype=wp.mat44d),
 ):  # fmt: skip
-    """Pose of an affine body before a pad, to column ``k``: the nearest rotation of x = A X + p, and p.
+    """Pose of an affine body x = A X + p before a pad, to column ``k``.
 
-    ``gradients``: of the hat functions of its corners, (4,); ``first``: the first corner at rest, body frame.
+    It is the rotation nearest to A, and p. ``gradients``: of the hat functions of its corners, (4,); ``first``: the first corner at
+    rest, body frame.
     """
     env = wp.tid()
     A = wp.mat33d()

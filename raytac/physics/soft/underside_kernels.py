@@ -1,4 +1,4 @@
-"""Kernels of ``Undersides``: lowest point of rigid parts and of triangles over each node of a pad."""
+"""Kernels of ``Undersides``: lowest points of parts and triangles over a pad's nodes."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -83,7 +83,7 @@ def underside_of_triangles(
     # outputs
     under: wp.array3d(dtype=wp.float64),
 ):
-    """Lower ``under`` to a triangle's plane, over the nodes that it covers, by (environment, face)."""
+    """Lower ``under`` to a triangle's plane over its nodes, by (environment, face)."""
     env, face = wp.tid()
     if sound[env] == 0 or not touching[env, body]:
         return
@@ -131,7 +131,7 @@ def remove_behind(
     # outputs
     under: wp.array3d(dtype=wp.float64),
 ):
-    """Remove what is far below the smooth coat where several objects touch, by (environment, row)."""
+    """Remove what is far below the smooth coat if several objects touch, along a row."""
     env, row = wp.tid()
     count = wp.int32(0)
     for body in range(touching.shape[1]):

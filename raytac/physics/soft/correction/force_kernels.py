@@ -1,4 +1,4 @@
-"""Forces on the vertices in contact that hold a mesh where it is, by one block of threads a pad."""
+"""Forces on vertices in contact that hold a mesh where it is, by one block a pad."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -42,9 +42,9 @@ def solve_in_one_block(
     Ap: wp.array2d(dtype=wp.float64),
     x: wp.array2d(dtype=wp.float64),
 ):
-    """x (B, n) with (matrix x) = ``wanted`` at the free unknowns, 0 elsewhere; conjugate gradients.
+    """x (B, n) with (matrix x) = ``wanted`` at the free unknowns, 0 elsewhere.
 
-    ``matrix`` (n, n) is symmetric and positive definite over them. It ends when ‖r‖ is below ``tolerance``.
+    By conjugate gradients. ``matrix`` (n, n) is symmetric and positive definite over them. It ends when ‖r‖ is below ``tolerance``.
     """
     env, lane = wp.tid()
     n = unknowns.count[env]
@@ -106,7 +106,7 @@ def respond(
     # outputs
     moved: wp.array2d(dtype=wp.float64),
 ):  # fmt: skip
-    """(matrix forces), (B, rows of the matrix), by (environment, row); only free unknowns have forces."""
+    """Matrix times forces, (B, rows), by (environment, row); free unknowns alone have forces."""
     env, row = wp.tid()
     total = wp.float64(0.0)
     for k in range(unknowns.count[env]):

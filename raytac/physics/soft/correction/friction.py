@@ -92,9 +92,9 @@ class FrictionCorrection:
         self._go = wp.zeros(1, dtype=wp.int32, device=device)
 
     def correct(self, dragged: wp.array, objects: Touched, sideways: wp.array) -> None:
-        """Launch the addition of A τ − E q to ``sideways``, after the solution of the normal contact.
+        """Launch the addition of A τ − E q to ``sideways``.
 
-        ``dragged``: v [m]; both (B, 2 V), float64, all x and then all y.
+        It comes after the solution of the normal contact. ``dragged``: v [m]; both (B, 2 V), float64, all x and then all y.
         """
         s, normal, settings = self.contact, self._normal, self._settings
         pads, each = len(self._sums), self._sums.shape

@@ -71,9 +71,10 @@ def choose_contacts(
     s: Contact,
     unknowns: Unknowns,
 ):  # fmt: skip
-    """Pads whose friction is corrected: those that one rigid object touches, whose coefficient is known.
+    """Pads whose friction is corrected.
 
-    ``dragged``: displacements of the vertices by friction, x and then y (B, 2 V) [m].
+    Those that one rigid object touches, whose coefficient is known. ``dragged``: displacements of the vertices by friction, x and
+    then y (B, 2 V) [m].
     """
     env = wp.tid()
     s.chosen[env] = 0
@@ -397,9 +398,9 @@ def slip_sums(
     # outputs
     sums: wp.array2d(dtype=Moments),
 ):  # fmt: skip
-    """Along a row: greatest error of the mean motion, and slip of nodes that stick; their number, that of nodes under load.
+    """Errors and numbers of a row.
 
-    And goal · goal, goal · mean.
+    Greatest error of the mean motion, and slip of nodes that stick; their number, that of nodes under load; goal · goal, goal · mean.
     """
     env, row = wp.tid()
     if not is_in(s, env, row):
@@ -431,7 +432,7 @@ def judge(
     # outputs
     s: Contact,
 ):  # fmt: skip
-    """Whether a contact is solved; else the next motion, and the friction where everything slides."""
+    """End of a search that is solved; else the next motion, and friction if all slides."""
     env = wp.tid()
     if s.active[env] == 0:
         return
@@ -531,7 +532,10 @@ def blend(
     # outputs
     sideways: wp.array2d(dtype=wp.float64),
 ):  # fmt: skip
-    """Add the layer's response to friction in place of the mesh's, (B, 2 V), as far as it explains the motion."""
+    """Add the layer's response to friction in place of the mesh's, (B, 2 V).
+
+    It is added as far as it explains the motion.
+    """
     env = wp.tid()
     if s.chosen[env] == 0 or s.failed[env] != 0:
         return

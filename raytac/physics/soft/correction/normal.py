@@ -10,12 +10,11 @@ import warp as wp
 from raytac.gel.interpolate import SplineAxis, hat_matrix
 from raytac.gel.products import Matrices, Products
 from raytac.gel.surface import PadGrid
+from raytac.physics.soft.clearance import hat_arrays
 from raytac.physics.soft.coat_surface import CoatSurface
 from raytac.physics.soft.correction import normal_kernels as kernels
-from raytac.physics.soft.correction.cosine_series import CosineSeries
-from raytac.physics.soft.correction.nodal_compliance import nodal_compliance
+from raytac.physics.soft.correction.cosine_series import CosineSeries, nodal_compliance
 from raytac.physics.soft.correction.vertex_forces import VertexForces
-from raytac.physics.soft.hats import hat_arrays
 from raytac.physics.soft.settings import Correction
 from raytac.specs.sensor import GelpadSpec
 
@@ -167,8 +166,8 @@ class NormalCorrection:
         self.surface.rise_of(self._remainder, self.rise)
         self.products.sandwich(self._rows, self.rise, self._columns, self._spare, self._over)
         gaps = [self.settings.open_gap, self.settings.clear_gap, self._rest, self._over.numbers, under, self.load]
-        found = [self._overlap.numbers, self._start.numbers, self._near]
-        self._launch(kernels.overlaps, lines, [self.hats, self._wide, *gaps, *found])
+        results = [self._overlap.numbers, self._start.numbers, self._near]
+        self._launch(kernels.overlaps, lines, [self.hats, self._wide, *gaps, *results])
         self._launch(kernels.choose_windows, each[0], [sound, clearance, self._near, s])
         self._launch(kernels.greatest_in_window, each[0], [s, self._start.numbers, self._greatest])
         begun = [self._p.numbers, self._t.numbers, self.pressure.numbers, self._overlapping]
@@ -208,7 +207,7 @@ class NormalCorrection:
         multiply(self._border[1], self._border_y, self._dent, columns=s.rows, adds=True, **window)
 
     def _find_border(self, pressure: Matrices, active: wp.array) -> None:
-        """Launch what the pad's free sides add under a pressure: ``forces`` and the dent at the vertices."""
+        """Launch what the pad's free sides add: ``forces`` and the dent at the vertices."""
         s, multiply = self.search, self.products.multiply
         multiply(pressure, self._force_x, self._over_x, rows=s.rows, inner=s.columns, active=active)
         multiply(self._force_y, self._over_x, self._over_vertices, inner=s.rows, active=active)
@@ -217,7 +216,7 @@ class NormalCorrection:
         self._launch(kernels.fold, self.load.shape, [self._border_flat, self._border_at.numbers])
 
     def _find_whole_dent(self) -> None:
-        """Launch ``waves``, ``forces`` and ``dent`` of the pressure that was found."""
+        """Launch ``waves``, ``forces`` and ``dent`` of the best pressure."""
         s, multiply, active = self.search, self.products.multiply, self.search.touched
         multiply(self._analysis[0], self.pressure, self._half, inner=s.rows, columns=s.columns, active=active)
         multiply(self._half, self._analysis[1], self.waves, inner=s.columns, active=active)
@@ -252,7 +251,9 @@ _SEARCH = {
     "tau": wp.float32, "best": wp.float64, "improved": wp.int32, "count": wp.int32,
 }  # fmt: skip
 _SHORTEST = 0.5
-"""c of the preconditioner, in units of the grid: the fewest steps for pins, a coin and a gear."""
+"""c of the preconditioner, in units of the grid.
+
+It needs the fewest steps for pins, a coin and a gear."""
 _SAME = 1e-12
 """Difference of the heights of vertices that is none [m]."""
 _MOST = 2000

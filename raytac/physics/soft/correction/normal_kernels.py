@@ -1,4 +1,4 @@
-"""Kernels of ``NormalCorrection``: vertices in contact, remainder, and the search for the pressure.
+"""Kernels of ``NormalCorrection``: vertices in contact, remainder, search for the pressure.
 
 A row of nodes is computed by one thread, and joined with the others of its pad by another, in their order.
 """
@@ -67,7 +67,7 @@ def choose_touching(
     touching: wp.array2d(dtype=wp.int32),
     unknowns: Unknowns,
 ):  # fmt: skip
-    """Vertices with more than the ``least`` share of the greatest load, and those of them that can move."""
+    """Vertices with more than the ``least`` share of the greatest load, and which can move."""
     env = wp.tid()
     most, count = wp.float64(0.0), wp.int32(0)
     for v in range(load.shape[1]):
@@ -116,7 +116,7 @@ def overlaps(
     pressure: wp.array3d(dtype=wp.float32),
     near: wp.array2d(dtype=wp.vec2i),
 ):  # fmt: skip
-    """Overlap of the coat without normal contact with the object [m], and a pressure to begin with.
+    """Overlap of the coat without normal contact [m], and a pressure to begin with.
 
     By (environment, row); ``near``: columns, from and to, of the row's nodes that may touch.
     """
@@ -244,7 +244,10 @@ def stiffen(
     z: wp.array3d(dtype=wp.float32),
     sums: wp.array2d(dtype=wp.vec3d),
 ):  # fmt: skip
-    """Preconditioned gap z along a row, and g·z: ``shortest`` − the five-point Laplacian, of g under pressure."""
+    """Preconditioned gap z along a row, and g·z.
+
+    ``shortest`` − the five-point Laplacian, of g under pressure.
+    """
     env, row = wp.tid()
     columns, rows = s.columns[env], s.rows[env]
     if s.active[env] == 0 or row < rows[0] or row >= rows[1]:
@@ -414,9 +417,10 @@ def convolve(
     # outputs
     out: wp.array3d(dtype=Any),
 ):  # fmt: skip
-    """Response along x to waves along y, Σ_k (c[|i − k|] + c[i + k]) half[k], of ``ROWS`` columns i.
+    """Response along x to waves along y, Σ_k (c[|i − k|] + c[i + k]) half[k].
 
-    By (environment, block, thread). ``half``, ``out``: by column and packet of waves along y; ``table``: c (2 nodes − 1, packets), the
+    Of ``ROWS`` columns i, by (environment, block, thread). ``half``, ``out``: by column and packet of waves along y; ``table``: c (2
+    nodes − 1, packets), the
     response at a distance to such a wave, which the mirror images at both edges have at the sum. The end nodes stand for half cells.
     """
     env, block, thread = wp.tid()

@@ -1,4 +1,4 @@
-"""Motions in the plane, and fields on evenly spaced nodes, for the kernels of a soft pad's correction."""
+"""Motions in the plane, and fields on evenly spaced nodes, for kernels."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false

@@ -42,7 +42,10 @@ class PlaneWaves:
 
     def __init__(self, along: tuple[CosineSeries, CosineSeries], x: np.ndarray, y: np.ndarray, products: Products,
                  waves: tuple[int, int] | None = None) -> None:  # fmt: skip
-        """``along``: series along x and y; ``waves``: rows and columns of amplitudes, from the longest on; None is all."""
+        """Prepare the lines ``x``, ``y`` [m].
+
+        ``along``: series along x and y; ``waves``: rows and columns of amplitudes, from the longest on; None is all.
+        """
         constant, self._products = products.constant, products
         rows, columns = (len(along[1].wave_numbers), len(along[0].wave_numbers)) if waves is None else waves
         self._cos_x, self._sin_x = (constant(f(x).T[:columns]) for f in (along[0].synthesis, along[0].sines))

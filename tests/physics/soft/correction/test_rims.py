@@ -11,9 +11,8 @@ import pytest
 from experiments.rims import waves
 from raytac.gel.surface import make_grid
 from raytac.physics.bonded_layer import layer_compliance
-from raytac.physics.soft.correction.cosine_series import CosineSeries
+from raytac.physics.soft.correction.cosine_series import CosineSeries, nodal_compliance
 from raytac.physics.soft.correction.mesh_compliance import coat_compliance
-from raytac.physics.soft.correction.nodal_compliance import nodal_compliance
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
 from raytac.specs import load_sensor
 from tests.physics.soft.oracles.coat_surface import CoatSurface

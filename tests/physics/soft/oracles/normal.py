@@ -8,8 +8,7 @@ import numpy as np
 
 from raytac.gel.components import span
 from raytac.gel.interpolate import SplineAxis, hat_matrix
-from raytac.physics.soft.correction.cosine_series import CosineSeries
-from raytac.physics.soft.correction.nodal_compliance import nodal_compliance
+from raytac.physics.soft.correction.cosine_series import CosineSeries, nodal_compliance
 from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
 from raytac.specs.sensor import GelpadSpec
 from tests.physics.soft.oracles.coat_surface import CoatPlaces, CoatSurface
