@@ -324,7 +324,7 @@ def carried(turning: Turning, env: wp.int32, v: wp.int32) -> wp.vec3d:
 def slid_before_contact(
     turning: Turning, env: wp.int32, verts: wp.vec4i, c: wp.vec4d, n: wp.vec3d, turn: wp.mat33d, d_hat: wp.float64
 ) -> wp.vec3d:
-    """Sliding [m] of a new pair, as its frames move, from the start of the step to where it comes within d̂."""
+    """Sliding [m] of a new pair, as its frames move, before it comes within d̂ in a step."""
     if verts[1] < 0:  # a plane
         return wp.vec3d()
     gap, d, n_start = wp.float64(0.0), wp.vec3d(), wp.transpose(turn) * n

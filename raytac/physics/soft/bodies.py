@@ -31,7 +31,7 @@ BODY_KINDS = ("kinematic", "affine", "soft", "half_space")
 _DRIVEN_SHARE = 0.2
 """Share of a soft object's height, from its top, that is driven."""
 _OWN_VOLUME = 0.25
-"""λ'/μ of a soft object's tetrahedra in their volume blocks, that of the coarse pad (``PadLevel.own_volume``)."""
+"""λ'/μ of a soft object's tetrahedra in their blocks, as of ``PadLevel.own_volume``."""
 
 
 @dataclass(frozen=True)

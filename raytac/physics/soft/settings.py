@@ -39,7 +39,7 @@ class Correction(_Settings):
     friction: bool = True
     """Correct how far the skin follows a sheared or twisted object (``FrictionCorrection``)."""
     pitch: float = 0.05e-3
-    """Least spacing of the fine grid [m], which else is the surface's own, if above 0.9 times this."""
+    """Least spacing of the fine grid [m]; the surface's own grid if above 0.9 times this."""
     gap_tolerance: float = 1e-6
     """Deepest overlap and widest gap under pressure of a solved contact [m]."""
     normal_iterations: int = 40
