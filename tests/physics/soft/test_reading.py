@@ -56,9 +56,8 @@ def pressed(device="cpu"):
         scene_body("box", (primitive("box", (1e-3, 2e-3, 1e-3)),), "kinematic", friction=0.9),
     ]
     ball, box = np.array([[-2e-3, 0.4e-3, 3.05e-3]] * 3), np.array([[5e-3, 0.0, 1.48e-3], [5e-3, 0.0, 8e-3], [5e-3, 0.0, 8e-3]])
-    start = {
-        name: np.stack([at(*p, turn) for p in places]) for name, places, turn in (("ball", ball, np.eye(4)), ("box", box, TURNED))
-    }
+    places = ("ball", ball, np.eye(4)), ("box", box, TURNED)
+    start = {name: np.stack([at(p[0], p[1], p[2], turn) for p in where]) for name, where, turn in places}
     scene = SoftScene(
         [ScenePad("pad", SENSOR, MESH)], bodies, np.eye(4)[None], start, num_envs=3, gravity=(0.0, 0.0, 0.0), device=device
     )
@@ -196,10 +195,10 @@ def test_soft_bodies_affine_ones_and_other_pads_are_read_as_they_are_touched():
     touching, objects = scene.world.touching("pad"), []
     assert touching["ball"].all() and touching["cube"].all()
     for name, mask in touching.items():
-        body: Any = scene.bodies.get(name)
+        body = scene.bodies.get(name)
         soft = body is None or body.is_soft
         surface = scene.skin(name, "pad") if soft else None
-        parts = () if soft else body.parts
+        parts = () if body is None else body.parts  # a soft body has none
         objects.append(ContactObject(parts, inverse @ scene.pose(name), surface, mask, None if soft else GELPAD.friction))
     state = scene.coat_state("pad")
     cube = scene.coat_state("pad").objects.poses.numpy()[:, 0]
