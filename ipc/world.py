@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ipc.bodies.body import AffineBody, Body, HalfSpace, SoftBody, rotation_matrix
 from ipc.bodies.layout import build_layout
+from ipc.body_arrays import BodyArrays, ContactArrays, WorldArrays
 from ipc.contact.overlap import OverlapCheck, find_overlap
 from ipc.errors import IpcError
 from ipc.report import ContactPairs, PairForces, PatchMotion, RigidMotion, StepReport, Wrench
@@ -71,6 +72,7 @@ class World:
         with LAUNCH:
             self._potential = Potential(self.layout, self.settings, num_envs, self.d_hat, self.kappa, self.device)
             self._newton = Newton(self._potential, self.layout, self.settings)
+        self._arrays = WorldArrays(self.layout, self._potential)
         self._failed = np.zeros(num_envs, bool)
         self._patches: dict[int, RestPatches] = {}
         self._check_overlap = OverlapCheck(self.layout)
@@ -156,6 +158,7 @@ class World:
                 self._rest.expect(alive)
                 self._expected |= alive
             values = self._newton.step(alive)
+            self._arrays.update()
         self._failed |= values["failed"].astype(bool)
         return StepReport(
             converged=values["converged"].astype(bool) | (~chosen & ~self._failed),
@@ -237,6 +240,17 @@ class World:
     def timers(self) -> dict[str, float]:
         """Seconds spent in ``step`` and its stages (on CUDA without ``Settings.cuda_graph``)."""
         return dict(self._newton.timers)
+
+    def arrays(self, name: str) -> BodyArrays:
+        """A body's positions, velocities and forces as arrays of the device, for DLPack; no copies."""
+        return self._arrays.body(self._index(name))
+
+    def contact_arrays(self) -> ContactArrays:
+        """All contact pairs as arrays of the device.
+
+        Ask again after a step, which may make more room.
+        """
+        return self._arrays.contacts()
 
     def frame(self, name: str) -> tuple[Floats, Floats]:
         """World rotations (B, 3, 3) and positions [m] (B, 3) of a driven body's or grip's frame."""
@@ -427,6 +441,7 @@ class World:
                 forces.assign(kept)
             s.set_frames(wp.zeros(self.num_envs, dtype=wp.float64, device=self.device), s.R, s.t)
             s.place_vertices(s.y, s.R, s.t, s.x)
+            self._arrays.update()
 
     def reset(self, envs: ArrayLike | None = None) -> None:
         """Put environments (a mask (B,), a list, or None for all) back to the start of the world."""

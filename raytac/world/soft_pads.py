@@ -14,16 +14,17 @@ from itertools import combinations
 
 import mujoco
 import numpy as np
+import warp as wp
 
 import ipc
 from raytac.device import resolve_device
 from raytac.errors import InputError, OverlapError, SpecError
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.gel.traction import CoatTraction
 from raytac.physics.base import PadReading
 from raytac.physics.configs import Ipc
 from raytac.physics.objects import object_parts
 from raytac.physics.soft.bodies import SceneBody, ScenePad, scene_body
+from raytac.physics.soft.coat_points import CoatMarkers, CoatTraction
 from raytac.physics.soft.mesh import pad_mesh
 from raytac.physics.soft.scene import SoftScene
 from raytac.physics.soft.scene_state import SceneReport
@@ -36,6 +37,7 @@ from raytac.specs.task import PAIR_FRICTION, TaskScene
 from raytac.world.coupling import Coupling, coupling_inputs
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.forbidden_overlap import Inside, RobotOverlap
+from raytac.world.warp_frame import WarpFrame
 from raytac.world.world_model import WorldModel
 from raytac.world.world_state import Drive, lost
 
@@ -114,6 +116,7 @@ class SoftPads:
         self._last_cases = self._pad_poses(datas)
         self._last_driven = {b.name: np.stack([starts[b.name]] * len(datas)) for b in self._driven}
         self._traction: dict[str, CoatTraction] = {}
+        self._markers: dict[str, CoatMarkers] = {}
         self._wrench = {m.name: np.zeros((len(datas), 6)) for m in composed.sensors}
         self._unconverged = np.zeros(len(datas), int)
         """Steps of the solver since the reset that did not meet its tolerance."""
@@ -203,12 +206,38 @@ class SoftPads:
         wrench = np.where(failed[:, None], np.nan, self._wrench[name])
 
         def traction(_: GelSurface) -> np.ndarray:
-            if name not in self._traction:
-                self._traction[name] = CoatTraction(self.soft.pads[name].mesh.coat, grid)
-            return self._traction[name](reading.forces)
+            return self._traction_on(name, grid)(reading.forces)
 
         result = PadReading(reading.surface, wrench, failed, traction, unconverged=self._unconverged.copy())
         return result if envs is None else result.of(envs)
+
+    def arrays(self, name: str, grid: PadGrid, failed: np.ndarray, markers: np.ndarray | None = None) -> WarpFrame:
+        """Readings of one sensor as arrays of the solver's device; the next reading overwrites them.
+
+        ``markers``: places of markers at rest (M, 2) [m], which move with the coat; None without.
+        """
+        mesh, device = self.soft.pads[name].mesh.coat, self.soft.world.device
+        shown = self.soft.arrays(name, grid, failed)
+        displacement = None
+        if markers is not None:
+            if name not in self._markers:
+                self._markers[name] = CoatMarkers(mesh, markers, len(failed), device)
+            displacement = self._markers[name].launch(shown.coat)
+        lost = failed | self.soft.failed
+        wrench = np.where(lost[:, None], np.nan, self._wrench[name])
+        return WarpFrame(
+            wp.array(wrench, dtype=wp.float64, device=device),
+            wp.array(~lost, dtype=wp.bool, device=device),
+            shown.height,
+            shown.contact,
+            displacement,
+            self._traction_on(name, grid).launch(shown.forces),
+        )
+
+    def _traction_on(self, name: str, grid: PadGrid) -> CoatTraction:
+        if name not in self._traction:
+            self._traction[name] = CoatTraction(self.soft.pads[name].mesh.coat, grid, self.soft.world.device)
+        return self._traction[name]
 
     def overlap(self, env: int) -> list[tuple[str, str, float]]:
         """Overlaps at the start: an empty list, since the solver raises an error for them."""

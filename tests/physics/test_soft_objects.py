@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from raytac.physics.soft.coat_state import CoatState, ContactObject
 from raytac.physics.soft.pad import SoftPad
 from raytac.specs import load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
@@ -53,13 +54,14 @@ def test_a_soft_balls_imprint_has_no_facets(soft):
     pad, _ = soft
     assert pad.solver is not None
     seen = pad.solver.coat_state(pad._drive.poses())
-    facets = replace(seen.objects[0], surface=pad.solver.scene.mesh("object", "pad"))
+    triangles = ContactObject((), np.eye(4)[None], pad.solver.scene.mesh("object", "pad"))
+    facets = CoatState.of(seen.vertices.numpy(), seen.forces.numpy(), [triangles])
     x, y = (a / 3e-3 for a in np.meshgrid(pad.grid.x, pad.grid.y))
     inside = np.hypot(x, y) < 0.3
     powers = np.stack([x[inside] ** i * y[inside] ** j for i in range(9) for j in range(9 - i)], axis=1)
     ripple = []
-    for objects in (seen.objects, (facets,)):
-        height = pad._reader.read(replace(seen, objects=objects), np.zeros(1, bool)).surface.height[0].astype(float)[inside]
+    for state in (seen, facets):
+        height = pad._reader.read(state, np.zeros(1, bool)).surface.height[0].astype(float)[inside]
         left = height - powers @ np.linalg.lstsq(powers, height, rcond=None)[0]
         ripple.append(float(np.sqrt((left**2).mean())))
     assert ripple[0] < 0.3 * ripple[1] and ripple[1] > 0.4e-6, f"ripple {ripple}"

@@ -5,16 +5,19 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike
 
 import ipc
 from raytac.errors import InputError, OverlapError
 from raytac.gel.surface import PadGrid, chosen_envs, make_grid
 from raytac.physics.soft.bodies import SceneBody, ScenePad, SceneRegistry, pad_body
+from raytac.physics.soft.coat_state import CoatState, SceneCoat
 from raytac.physics.soft.mesh import pad_stiffness
-from raytac.physics.soft.reading import CoatState, ContactObject, SoftReader, SoftReading
+from raytac.physics.soft.reading import PadArrays, SoftReader, SoftReading
 from raytac.physics.soft.scene_state import Poses, SceneReport, SceneState
 from raytac.physics.soft.settings import SceneSettings
 from raytac.physics.soft.sleep import Sleep
@@ -122,6 +125,7 @@ class SoftScene:
         self._asleep = np.zeros(self.num_envs, bool)
         self._energies = np.zeros(self.num_envs), np.zeros(self.num_envs)
         self._readers: dict[str, SoftReader] = {}
+        self._coats: dict[str, SceneCoat] = {}
         self._coat_numbers = {name: self._surface_numbers(pad) for name, pad in self.pads.items()}
         self._failed = np.zeros(self.num_envs, bool)
 
@@ -319,25 +323,38 @@ class SoftScene:
 
     def reading(self, pad: str, grid: PadGrid | None = None, failed: np.ndarray | None = None) -> SoftReading:
         """Surface, contact, forces of a pad on its own grid or another; NaN where ``failed`` (B,)."""
+        reader, lost = self._reader(pad, grid), self._failed if failed is None else self._failed | failed
+        return reader.read(self.coat_state(pad), lost)
+
+    def arrays(self, pad: str, grid: PadGrid | None = None, failed: np.ndarray | None = None) -> PadArrays:
+        """As ``reading``, but arrays of the device that the next reading overwrites: no copies."""
+        lost = self._failed if failed is None else self._failed | failed
+        given = wp.array(lost, dtype=wp.bool, device=self.world.device)
+        return self._reader(pad, grid).launch(self.coat_state(pad), given)
+
+    def _reader(self, pad: str, grid: PadGrid | None) -> SoftReader:
         scene_pad = self._registry.pad(pad)
         if pad not in self._readers or (grid is not None and grid is not self._readers[pad].grid):
             mesh = replace(scene_pad.mesh, d_hat=self.world.d_hat)
             self._readers[pad] = SoftReader(mesh, scene_pad.sensor.gelpad, grid or self.grid(pad), scene_pad.correction)
-        return self._readers[pad].read(self.coat_state(pad), self._failed if failed is None else self._failed | failed)
+        return self._readers[pad]
 
     def coat_state(self, pad: str) -> CoatState:
-        """A pad's coat with the forces on it, and the objects that it touches."""
-        frame = inverse(self.pose(self._registry.pad(pad).name))
-        objects = []
-        for name, touching in self.world.touching(pad).items():
-            body = self.bodies.get(name)
-            if body is not None and not body.is_soft:
-                # As in the solver, the last coefficient of a pair counts if it was given in both orders.
-                mu = [mu for pair, mu in self._friction.items() if set(pair) == {pad, name}][-1]
-                objects.append(ContactObject(body.parts, frame @ self.pose(name), None, touching, mu))
-            elif name != pad:
-                objects.append(ContactObject((), frame @ self.pose(name), self.skin(name, pad), touching))
-        return CoatState(self.coat(pad), self.coat_forces(pad), tuple(objects))
+        """A pad's coat with the forces on it, and the objects that it touches, on the device.
+
+        The next call overwrites it.
+        """
+        if pad not in self._coats:
+            others = [other for name, other in self.pads.items() if name != pad]
+            # As in the solver, the last coefficient of a pair counts if it was given in both orders.
+            friction = {name: mu for pair, mu in self._friction.items() if pad in pair for name in pair if name != pad}
+            self._coats[pad] = SceneCoat(self.world, self._registry.pad(pad), others, self.bodies, friction)
+        coat = self._coats[pad]
+        state = coat.read()
+        for name, k in coat.free.items():  # the rotation that fits a soft body best comes from the host
+            column: Any = state.objects.poses[:, k]
+            column.assign(inverse(self.pose(pad)) @ self.pose(name))
+        return state
 
     def save(self) -> SceneState:
         """The state of every environment."""

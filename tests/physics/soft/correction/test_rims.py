@@ -10,12 +10,12 @@ import pytest
 
 from raytac.gel.surface import make_grid
 from raytac.physics.bonded_layer import layer_compliance
-from raytac.physics.soft.coat_surface import CoatSurface
-from raytac.physics.soft.correction.cosine_series import CosineSeries
+from raytac.physics.soft.correction.cosine_series import CosineSeries, nodal_compliance
 from raytac.physics.soft.correction.mesh_compliance import coat_compliance
-from raytac.physics.soft.correction.normal import ContactSampler, NormalCorrection, nodal_compliance
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
 from raytac.specs import load_sensor
+from tests.physics.soft.oracles.coat_surface import CoatSurface
+from tests.physics.soft.oracles.normal import ContactSampler, NormalCorrection
 
 MINI = load_sensor("gelsight_mini").gelpad
 GELPAD = replace(MINI, size=(6e-3, 5e-3))
