@@ -43,42 +43,6 @@ def barrier_second(D: wp.float64, Dh: wp.float64) -> wp.float64:
     return -wp.float64(2.0) * wp.log(D / Dh) - wp.float64(4.0) * q + q * q
 
 
-STIFFENING = wp.constant(wp.float64(0.01))
-"""σ²: below a gap of σ d̂ the barrier grows stiffer."""
-
-
-@wp.func
-def contact_barrier(D: wp.float64, Dh: wp.float64) -> wp.float64:
-    """b(D) + s(D) [m⁴]."""
-    u = D / (STIFFENING * Dh)
-    b = barrier(D, Dh)
-    if u < wp.float64(1.0):
-        v = wp.float64(1.0) - u
-        b += STIFFENING * STIFFENING * Dh * Dh * v * v * v / u
-    return b
-
-
-@wp.func
-def contact_barrier_first(D: wp.float64, Dh: wp.float64) -> wp.float64:
-    """b'(D) + s'(D) [m²]."""
-    u = D / (STIFFENING * Dh)
-    b = barrier_first(D, Dh)
-    if u < wp.float64(1.0):
-        v = wp.float64(1.0) - u
-        b -= STIFFENING * Dh * v * v * (wp.float64(2.0) + wp.float64(1.0) / u) / u
-    return b
-
-
-@wp.func
-def contact_barrier_second(D: wp.float64, Dh: wp.float64) -> wp.float64:
-    """b''(D) + s''(D) [-]."""
-    u = D / (STIFFENING * Dh)
-    b = barrier_second(D, Dh)
-    if u < wp.float64(1.0):
-        b += wp.float64(2.0) / (u * u * u) - wp.float64(2.0)
-    return b
-
-
 @wp.func
 def mollifier(c: wp.float64, eps: wp.float64) -> wp.float64:
     """m(c) of c = ‖(a1 − a0) × (b1 − b0)‖², 1 from c = eps on (Li et al. 2020, eq. 24)."""

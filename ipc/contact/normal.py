@@ -18,14 +18,7 @@ import warp as wp
 
 from ipc.arrays import FloatArray, IntArray, MatArray2d, VecArray2d
 from ipc.broad_phase.lists import Candidates, Surface, pair_at, pair_vertices, pairs_of
-from ipc.contact.barrier import (
-    contact_barrier,
-    contact_barrier_first,
-    contact_barrier_second,
-    mollifier,
-    mollifier_first,
-    mollifier_second,
-)
+from ipc.contact.barrier import barrier, barrier_first, barrier_second, mollifier, mollifier_first, mollifier_second
 from ipc.contact.contacts import Contacts, push_contact, push_matrix, push_row
 from ipc.contact.distance import pair_coefficients, separation
 
@@ -75,13 +68,13 @@ def push_simple(
     """Force, contact and row of a pair without mollifier; ``scale`` is A κ/d̂³."""
     d = wp.sqrt(D)
     n = t / d
-    first, second = contact_barrier_first(D, Dh), contact_barrier_second(D, Dh)
+    first, second = barrier_first(D, Dh), barrier_second(D, Dh)
     slope = scale * wp.float64(2.0) * d * first
     k = wp.sqrt(scale * wp.max(wp.float64(0.0), wp.float64(2.0) * first + wp.float64(4.0) * D * second))
     for i in range(4):
         if verts[i] >= 0:
             wp.atomic_add(gradient, env, verts[i], (slope * coef[i]) * n)
-    wp.atomic_add(energy, env, scale * contact_barrier(D, Dh))
+    wp.atomic_add(energy, env, scale * barrier(D, Dh))
     push_contact(out, env, verts, coef, n, d, -slope, pair)
     push_row(out, env, verts, (k * coef[0]) * n, (k * coef[1]) * n, (k * coef[2]) * n, (k * coef[3]) * n)
 
@@ -108,8 +101,8 @@ def push_mollified(
     zero, two = wp.float64(0.0), wp.float64(2.0)
     d = wp.sqrt(D)
     n = t / d
-    first, second = contact_barrier_first(D, Dh), contact_barrier_second(D, Dh)
-    f = scale * contact_barrier(D, Dh)
+    first, second = barrier_first(D, Dh), barrier_second(D, Dh)
+    f = scale * barrier(D, Dh)
     f_d = scale * two * d * first
     f_dd = scale * (two * first + wp.float64(4.0) * D * second)
     m, m1, m2 = mollifier(c, eps), mollifier_first(c, eps), mollifier_second(c, eps)
@@ -233,7 +226,7 @@ def pair_energy(x: VecArray2d, surface: Surface, env: wp.int32, ee: wp.bool, pai
     """Energy of two edges (``ee``) or of a vertex and a face, over κ/d̂³ [m⁶]."""
     v = pair_vertices(surface, ee, pair)
     x0, x1, x2, x3 = x[env, v[0]], x[env, v[1]], x[env, v[2]], x[env, v[3]]
-    b = contact_barrier(wp.length_sq(separation(pair_coefficients(ee, x0, x1, x2, x3), x0, x1, x2, x3)), surface.d_hat * surface.d_hat)
+    b = barrier(wp.length_sq(separation(pair_coefficients(ee, x0, x1, x2, x3), x0, x1, x2, x3)), surface.d_hat * surface.d_hat)
     if b == wp.float64(0.0):
         return b
     energy = pair_weight(surface, ee, pair) * b
@@ -291,5 +284,5 @@ def energy_plane(
         d1 = wp.dot(n, x1[env, v] - frame_t[env, body])
         if d0 < surface.d_hat or d1 < surface.d_hat:
             Dh = surface.d_hat * surface.d_hat
-            e = surface.vert_area[v] * (contact_barrier(d1 * d1, Dh) - contact_barrier(d0 * d0, Dh))
+            e = surface.vert_area[v] * (barrier(d1 * d1, Dh) - barrier(d0 * d0, Dh))
             wp.atomic_add(change, env, scale_of(surface, kappa[env]) * e)
