@@ -32,7 +32,7 @@ class Settings:
         friction_relags: number of times that a step may renew the normal forces and tangents that bound friction after its first solve;
             a step that still changes them then has not converged. 0: they are those at the start of the step, unchecked.
         friction_tolerance: a step renews them until they change by less than this fraction [-].
-        linear_tolerance: relative residual ‖r‖/‖g‖ of the linear solve whose step p may end a step, being within ``velocity_tolerance`` [-].
+        linear_tolerance: relative residual ‖r‖/‖g‖ of the linear solve whose p is within ``velocity_tolerance`` and may be the last [-].
         forcing: the same of the other linear solves [-]; they are never solved closer than to ``linear_tolerance``.
         max_linear: PCG iterations a solve.
         preconditioner: of PCG: ``"block_jacobi"``, ``"rest_inverse"`` (bonded bodies' rest matrix inverted once, contacts as a low-rank

@@ -1,6 +1,6 @@
 """Block-Jacobi: 3×3 diagonal blocks with contacts, and the affine bodies eliminated."""
 
-# pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
 # pyright: reportOperatorIssue=false
 
 from __future__ import annotations
@@ -30,9 +30,7 @@ def diagonal_blocks(system: SystemView, active: IntArray, out: MatArray2d):
 
 
 @wp.kernel
-def diagonal_rows(
-    system: SystemView, contacts: Contacts, spread: wp.bool, active: IntArray, lanes: wp.int32, out: MatArray2d
-):
+def diagonal_rows(system: SystemView, contacts: Contacts, spread: wp.bool, active: IntArray, lanes: wp.int32, out: MatArray2d):
     """Adds the diagonal blocks of Σ q qᵀ; with ``spread``, s sᵀ/β of rows that couple soft nodes with an affine body."""
     env, lane = wp.tid()
     if active[env] == 0:

@@ -12,8 +12,8 @@ import warp as wp
 import ipc
 from ipc.bodies import Layout, build_layout, rotation_matrix
 from ipc.contact.contacts import Contacts, mat34d
-from ipc.solver.frames import VertexMap
 from ipc.solver.block_jacobi import BlockJacobi
+from ipc.solver.frames import VertexMap
 from ipc.solver.linear import SystemView
 from ipc.solver.preconditioners import pays
 from ipc.solver.preconditioners.rest_inverse import RestInverse
