@@ -1,4 +1,4 @@
-"""The affine bodies' part of block-Jacobi: their unknowns are eliminated, with all contacts between them and with soft bodies.
+"""Elimination of the unknowns of affine bodies in block-Jacobi, with all their contacts.
 
 With soft nodes s and the nodes a of affine bodies, four a body, block-Jacobi of H = [H_ss C; Cᵀ A] would forget C and all but the diagonal
 blocks of A. A stiff contact then holds each side in place, and conjugate gradients take an iteration for every motion that both sides
@@ -43,7 +43,7 @@ _BLOCK_BYTES = 72
 
 @wp.struct
 class Elimination:
-    """Work space of the elimination, A affine nodes (four a body) and s soft nodes that may touch them.
+    """Work space of the elimination: A affine nodes, s soft nodes that may touch them.
 
     ``node`` (A,): affine nodes, body by body.    ``place`` (N,): a node's number among them or −1.
     ``soft_node`` (s,): soft surface nodes that are unknowns.    ``soft_place`` (N,): a node's number among them or −1.

@@ -216,7 +216,7 @@ class Newton:
             self.preconditioner.update(pot.system, contacts, contacts.row.shape[1], mask)
 
     def _iterate_linear(self, mask: wp.array, tolerance: float) -> None:
-        """Conjugate gradients from p as it is, until the residual is a ``tolerance`` of what it is now."""
+        """Improve p by conjugate gradients until a share ``tolerance`` of the residual remains."""
         pot, s = self.potential, self.pcg.scalars
         with self._stage("pcg"):
             self.pcg.solve(

@@ -161,7 +161,7 @@ class Pcg:
         max_iterations: int,
         active: wp.array,
     ) -> None:
-        """Add the solution of H δ = residual to x for active environments; ``scalars`` has iterations.
+        """Add the solution of H δ = residual to x; ``scalars`` has iterations.
 
         Args:
             system, contacts: the matrix.
