@@ -33,7 +33,7 @@ class Settings:
             a step that still changes them then has not converged. 0: they are those at the start of the step, unchecked.
         friction_tolerance: a step renews them until they change by less than this fraction [-].
         linear_tolerance: relative residual ‖r‖/‖g‖ of the linear solve whose p is within ``velocity_tolerance`` and may be the last [-].
-        forcing: the same of the other linear solves [-]; they are never solved closer than to ``linear_tolerance``.
+        forcing: the same of the other linear solves [-]; 0: that of ``linear_tolerance``, which is the least.
         max_linear: PCG iterations a solve.
         preconditioner: of PCG: ``"block_jacobi"``, ``"rest_inverse"`` (bonded bodies' rest matrix inverted once, contacts as a low-rank
             part; ``docs/ipc-preconditioners.md``), or ``"auto"``, whichever was measured to be faster on the device.
@@ -65,7 +65,7 @@ class Settings:
     friction_relags: int = 30
     friction_tolerance: float = 0.01
     linear_tolerance: float = 1e-2
-    forcing: float = 1e-2
+    forcing: float = 0.0
     max_linear: int = 2000
     preconditioner: Literal["auto", "block_jacobi", "rest_inverse"] = "auto"
     max_line_search: int = 30
@@ -81,7 +81,7 @@ class Settings:
     deterministic: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("dt", "velocity_tolerance", "friction_slip", "linear_tolerance", "forcing", "friction_tolerance"):
+        for name in ("dt", "velocity_tolerance", "friction_slip", "linear_tolerance", "friction_tolerance"):
             if not getattr(self, name) > 0:
                 raise IpcError(f"{name} = {getattr(self, name)}: it must be positive")
         if len(self.gravity) != 3 or not all(isfinite(g) for g in self.gravity):
@@ -95,6 +95,8 @@ class Settings:
                 raise IpcError(f"{name} = {value}: it must be positive, or None for the default")
         if not self.friction >= 0:
             raise IpcError(f"friction = {self.friction}: a coefficient cannot be negative")
+        if not self.forcing >= 0:
+            raise IpcError(f"forcing = {self.forcing}: a residual cannot be negative; 0 is that of linear_tolerance")
         if self.friction_relags < 0:
             raise IpcError(f"friction_relags = {self.friction_relags}: it cannot be negative")
         if self.preconditioner not in ("auto", "block_jacobi", "rest_inverse"):

@@ -255,7 +255,6 @@ def press(preconditioner: str, steps: int = 4, max_contacts: int | None = None, 
         "friction": 0.5,
         "velocity_tolerance": 1e-7,
         "linear_tolerance": 1e-6,
-        "forcing": 1e-6,
     } | changes
     settings = ipc.Settings(preconditioner=preconditioner, **options)  # pyright: ignore[reportArgumentType]
     world = ipc.World([bonded_pad(small_pad()), ball], settings, num_envs=2, device="cpu")
