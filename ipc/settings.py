@@ -6,7 +6,13 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Literal
 
+import numpy as np
+
+from ipc.bodies.layout import Layout
 from ipc.errors import IpcError
+
+RIGID_STIFFNESS = 1e5
+"""Least κ of a world without a soft body [Pa]."""
 
 
 @dataclass(frozen=True)
@@ -19,14 +25,15 @@ class Settings:
         velocity_tolerance: Newton stops once no unknown would move faster than this [m/s]: ‖p‖_∞ ≤ velocity_tolerance · h.
         max_newton: Newton iterations a step; reaching it is reported, and the state so far is kept.
         d_hat: distance below which surfaces repel [m]; None: 0.1 of the shortest edge on the deformable surfaces.
-        kappa: barrier stiffness κ [Pa]; None: the largest Young's modulus of the soft bodies (1e5 Pa without one).
+        kappa: barrier stiffness κ [Pa]; None: :func:`barrier_stiffness` of the bodies.
         friction: default coefficient μ [-] of every pair of bodies (``World`` takes exceptions by name).
         friction_slip: ε [m]; the elastic slip at which a contact yields: friction grows smoothly from zero to its limit over this way,
             and is remembered. Contacts are softer to shear by 2μλ/ε in series, so ε is to be small against the motions of interest.
         friction_relags: number of times that a step may renew the normal forces and tangents that bound friction after its first solve;
             a step that still changes them then has not converged. 0: they are those at the start of the step, unchecked.
         friction_tolerance: a step renews them until they change by less than this fraction [-].
-        linear_tolerance: relative residual ‖r‖/‖g‖ of the linear solve [-].
+        linear_tolerance: relative residual ‖r‖/‖g‖ of the linear solve whose p is within ``velocity_tolerance`` and may be the last [-].
+        forcing: the same of the other linear solves [-]; 0: that of ``linear_tolerance``, which is the least.
         max_linear: PCG iterations a solve.
         preconditioner: of PCG: ``"block_jacobi"``, ``"rest_inverse"`` (bonded bodies' rest matrix inverted once, contacts as a low-rank
             part; ``docs/ipc-preconditioners.md``), or ``"auto"``, whichever was measured to be faster on the device.
@@ -58,6 +65,7 @@ class Settings:
     friction_relags: int = 30
     friction_tolerance: float = 0.01
     linear_tolerance: float = 1e-2
+    forcing: float = 0.0
     max_linear: int = 2000
     preconditioner: Literal["auto", "block_jacobi", "rest_inverse"] = "auto"
     max_line_search: int = 30
@@ -87,6 +95,8 @@ class Settings:
                 raise IpcError(f"{name} = {value}: it must be positive, or None for the default")
         if not self.friction >= 0:
             raise IpcError(f"friction = {self.friction}: a coefficient cannot be negative")
+        if not self.forcing >= 0:
+            raise IpcError(f"forcing = {self.forcing}: a residual cannot be negative; 0 is that of linear_tolerance")
         if self.friction_relags < 0:
             raise IpcError(f"friction_relags = {self.friction_relags}: it cannot be negative")
         if self.preconditioner not in ("auto", "block_jacobi", "rest_inverse"):
@@ -98,3 +108,17 @@ class Settings:
         for name in ("armijo", "ccd_slack", "motion_fraction", "gap_floor", "poor_advance", "blocked_advance"):
             if not 0 < getattr(self, name) < 1:
                 raise IpcError(f"{name} = {getattr(self, name)}: it must lie between 0 and 1")
+
+
+def barrier_stiffness(layout: Layout, dt: float) -> float:
+    """κ [Pa] for the bodies of a world and its time step.
+
+    The largest of the Young's moduli of soft bodies (1e5 Pa without one) and of ρ V^(2/3) (1 + s)/h² of the affine bodies, s being the
+    strength of a drive. That is the pressure on a face of the body that moves it, or pulls it from its drive, by its own size in a step,
+    and so the order of the largest that a contact has to bear. A barrier is not made stiffer than the affine body itself.
+
+    It depends on nothing that changes as the world moves, so that forces and energies are functions of the state alone: a press does not
+    depend on what was pressed before.
+    """
+    inertia = np.minimum(layout.affine_inertia / dt**2, layout.affine_stiffness)
+    return float(max(layout.max_young or RIGID_STIFFNESS, inertia.max(initial=0.0)))

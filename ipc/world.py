@@ -14,7 +14,7 @@ from ipc.body_arrays import BodyArrays, ContactArrays, WorldArrays
 from ipc.contact.overlap import OverlapCheck, find_overlap
 from ipc.errors import IpcError
 from ipc.report import ContactPairs, PairForces, PatchMotion, RigidMotion, StepReport, Wrench
-from ipc.settings import Settings
+from ipc.settings import Settings, barrier_stiffness
 from ipc.solver.forces import bond_wrench, contact_pairs, contact_wrench, host, pair_forces, rigid_motion, touching
 from ipc.solver.newton import Newton
 from ipc.solver.patch_motion import RestPatches
@@ -68,7 +68,7 @@ class World:
                 f"device = {device!r}: choose 'auto' or one of {', '.join(d.alias for d in wp.get_devices())}"
             ) from error
         self.d_hat = self.settings.d_hat or 0.1 * self.layout.min_edge
-        self.kappa = self.settings.kappa or self.layout.max_young or 1e5
+        self.kappa = self.settings.kappa or barrier_stiffness(self.layout, self.settings.dt)
         with LAUNCH:
             self._potential = Potential(self.layout, self.settings, num_envs, self.d_hat, self.kappa, self.device)
             self._newton = Newton(self._potential, self.layout, self.settings)

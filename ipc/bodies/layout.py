@@ -57,6 +57,7 @@ class Layout:
         edges (E, 2), edge_area (E,), faces (F, 3), edge_rest2: squared rest length [m²] (E,).
         pairs (P, 2): bodies that may touch; a half-space comes second.    friction (P,): μ of each.
         min_edge: shortest edge on soft or affine bodies [m].    max_young: largest of the soft bodies [Pa]; 0 without one.
+        affine_inertia: ρ V^(2/3) (1 + s) of each affine body [kg/m] (A,).    affine_stiffness: their κ [Pa] (A,).
     """
 
     names: tuple[str, ...]
@@ -125,6 +126,8 @@ class Layout:
     friction: Floats
     min_edge: float
     max_young: float
+    affine_inertia: Floats
+    affine_stiffness: Floats
 
 
 _NUMBERS = ("node_rest", "node_damping", "node_drive", "aim_local", "grads", "volume", "mu", "lam", "own")
@@ -218,6 +221,8 @@ def _affine(body: AffineBody) -> tuple[TriMesh, Arrays]:
     corners, weights, mass, volume = _affine_mass(body)
     row, col = np.meshgrid(np.arange(4), np.arange(4), indexing="ij")
     return body.surface, {
+        "affine_inertia": np.array([body.material.density * volume ** (2 / 3) * (1 + body.drive)]),
+        "affine_stiffness": np.array([body.material.stiffness]),
         "node_rest": corners @ rotation_matrix(body.pose.rotation).T + body.pose.position,
         "node_free": np.ones(4),
         "node_damping": np.zeros(4),
@@ -378,7 +383,8 @@ def build_layout(
 
     def joined(name: str, start: Ints | None = None) -> NDArray:
         """Arrays of all bodies; indices count from each body's ``start``."""
-        return np.concatenate([a[name] + (0 if start is None else start[k]) for k, (_, a) in enumerate(parts) if name in a])
+        arrays = [a[name] + (0 if start is None else start[k]) for k, (_, a) in enumerate(parts) if name in a]
+        return np.concatenate(arrays) if arrays else np.zeros(0)
 
     meshes = [mesh for mesh, _ in parts]
     topologies = [surface_topology(mesh.vertices, mesh.faces) if mesh else None for mesh in meshes]
@@ -453,6 +459,8 @@ def build_layout(
         friction=mus,
         min_edge=float(edge_rest2[deformable].min()) ** 0.5,
         max_young=max((body.material.young for body in bodies if isinstance(body, SoftBody)), default=0.0),
+        affine_inertia=_floats(joined("affine_inertia")),
+        affine_stiffness=_floats(joined("affine_stiffness")),
         **{name: _floats(joined(name)) for name in _NUMBERS},
         **frames,
         **volumes,

@@ -1,4 +1,4 @@
-"""The affine bodies' part of block-Jacobi: their unknowns are eliminated, with all contacts between them and with soft bodies.
+"""Elimination of the unknowns of affine bodies in block-Jacobi, with all their contacts.
 
 With soft nodes s and the nodes a of affine bodies, four a body, block-Jacobi of H = [H_ss C; Cᵀ A] would forget C and all but the diagonal
 blocks of A. A stiff contact then holds each side in place, and conjugate gradients take an iteration for every motion that both sides
@@ -7,7 +7,8 @@ make together. Here M keeps C and A as they are:
     M = [D C; Cᵀ A],    x_a = S⁻¹ (r_a − Cᵀ D⁻¹ r_s),    x_s = D⁻¹ (r_s − C x_a),    S = A − Cᵀ D⁻¹ C,
 
 which is a block LDLᵀ factorisation (Golub, Van Loan 2013, section 4.1.5), with D of 3×3 blocks. D has to be large enough for the couplings
-between soft nodes that it lacks. A row q = (s_1, …, s_m; g) of the contact Hessian, s_i at soft nodes and g at an affine body, is replaced by
+between soft nodes that it lacks. A row q = (s_1, …, s_m; g) of the contact Hessian, s_i at soft nodes and g at an affine body,
+is replaced by
 
     Σ_i β_i (s_i·x_i/β_i + g·x_a)² ≥ (Σ_i s_i·x_i + g·x_a)²,    β_i = ‖s_i‖ / Σ_j ‖s_j‖,
 
@@ -42,7 +43,7 @@ _BLOCK_BYTES = 72
 
 @wp.struct
 class Elimination:
-    """Work space of the elimination, A affine nodes (four a body) and s soft nodes that may touch them.
+    """Work space of the elimination: A affine nodes, s soft nodes that may touch them.
 
     ``node`` (A,): affine nodes, body by body.    ``place`` (N,): a node's number among them or −1.
     ``soft_node`` (s,): soft surface nodes that are unknowns.    ``soft_place`` (N,): a node's number among them or −1.
@@ -356,9 +357,7 @@ class AffineElimination:
     def finish(self, inverse: wp.array, r: wp.array, running: wp.array, z: wp.array) -> None:
         """z = M⁻¹ r from z = D⁻¹ r for the running environments."""
         inputs = [self.view, inverse, r, running, self.threads]
-        wp.launch(
-            eliminate, dim=(self.batch, self.threads), inputs=inputs, outputs=[z], device=self.device, block_dim=THREADS
-        )
+        wp.launch(eliminate, dim=(self.batch, self.threads), inputs=inputs, outputs=[z], device=self.device, block_dim=THREADS)
 
 
 def _affine_nodes(layout: Layout) -> np.ndarray:

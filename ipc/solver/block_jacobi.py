@@ -1,6 +1,6 @@
 """Block-Jacobi: 3×3 diagonal blocks with contacts, and the affine bodies eliminated."""
 
-# pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false
 # pyright: reportOperatorIssue=false
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ def diagonal_blocks(system: SystemView, active: IntArray, out: MatArray2d):
 
 
 @wp.kernel
-def diagonal_rows(
-    system: SystemView, contacts: Contacts, spread: wp.bool, active: IntArray, lanes: wp.int32, out: MatArray2d
-):
-    """Adds the diagonal blocks of Σ q qᵀ; with ``spread``, s sᵀ/β of rows that couple soft nodes with an affine body."""
+def diagonal_rows(system: SystemView, contacts: Contacts, spread: wp.bool, active: IntArray, lanes: wp.int32, out: MatArray2d):
+    """Adds the diagonal blocks of Σ q qᵀ.
+
+    With ``spread`` they are s sᵀ/β in rows that couple soft nodes with an affine body.
+    """
     env, lane = wp.tid()
     if active[env] == 0:
         return
@@ -88,7 +89,7 @@ class BlockJacobi:
         self.inverse = wp.zeros((batch, len(layout.node_rest)), dtype=wp.mat33d, device=device)
         self.affine = AffineElimination(layout, batch, lanes, device) if eliminate and fits(layout, batch) else None
         self.elimination = self.affine.view if self.affine else Elimination()
-        """What the kernel of :mod:`ipc.solver.pcg_block` reads; its arrays are empty where nothing is eliminated."""
+        """Arrays for :mod:`ipc.solver.pcg_block`, empty where nothing is eliminated."""
 
     def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
         """Take in the matrix of the active environments; ``rows`` is the largest row count."""

@@ -1,4 +1,4 @@
-"""Threads of a block, which share the work on one environment; on a CPU a block is one thread."""
+"""Threads of a block, which share one environment; on a CPU a block is one thread."""
 
 # pyright: reportArgumentType=false, reportInvalidTypeForm=false
 

@@ -138,6 +138,18 @@ def after_solve(iterations: IntArray, negative: IntArray, mask: IntArray, d: Dec
 
 
 @wp.kernel
+def choose_tightening(tolerance: wp.float64, dt: FloatArray, d: Decisions, f: Flags):
+    """Solves on where a loosely solved step is so small that it may be the last."""
+    env = wp.tid()
+    go = 0
+    if d.active[env] != 0 and d.advancing[env] == 0 and f.halt[0] == 0:
+        if d.size[env] <= tolerance * dt[env]:
+            go = 1
+            f.tighten[0] = 1
+    d.tightening[env] = go
+
+
+@wp.kernel
 def judge_direction(dt: FloatArray, d: Decisions, f: Flags):
     """Drops environments that are not finite; others advance frames or take a plain step."""
     env = wp.tid()

@@ -4,7 +4,8 @@ A Newton iteration has four parts:
 (i) While driven frames have not arrived, their motion enters the right-hand side, so that the unknowns make room for them in the same step.
 Frames and unknowns then move together as far as gaps allow.
 (ii) H p = −g is solved by PCG, with the exact Hessian first, and with a positive semi-definite one once negative curvature is met
-(projection on demand, after Longva et al. 2023, "Pitfalls of Projection").
+(projection on demand, after Longva et al. 2023, "Pitfalls of Projection"). It is solved loosely, as in inexact Newton methods (Dembo,
+Eisenstat, Steihaug 1982), and to the linear tolerance only where p is so small that it may be the last.
 (iii) Continuous collision detection limits the step.
 (iv) The step is halved until the energy falls enough and no tetrahedron is inverted.
 
@@ -50,6 +51,7 @@ class Newton:
         self.preconditioner = make_preconditioner(layout, settings, self.batch, lanes, self.device)
         self._still = wp.zeros_like(potential.x)
         self._friction = int(potential.collision.friction)
+        self._loose = max(settings.linear_tolerance, settings.forcing)
         self._graphs: dict[str, Any] = {}
         self._recording = False
         self.timers: dict[str, float] = {}
@@ -168,6 +170,9 @@ class Newton:
             wp.capture_if(f.advance, pot.push_prescribed, mask=d.advancing)
         self._solve()
         pot.size_of_step(d.active, d.size)
+        if self._loose > settings.linear_tolerance:
+            state.launch(decisions.choose_tightening, settings.velocity_tolerance, pot.dt)
+            wp.capture_if(f.tighten, self._tighten)
         state.launch(decisions.judge_direction, pot.dt)
         with self._stage("advance"):
             wp.capture_if(f.advance, self._advance)
@@ -192,27 +197,41 @@ class Newton:
         pot, state = self.potential, self.state
         pot.p.zero_()
         wp.copy(pot.right_side, pot.residual)
-        self._solve_for(state.decisions.active)
-        wp.capture_if(state.flags.again, self._solve_again)
+        self._update_preconditioner(state.decisions.active)
+        self._iterate_linear(state.decisions.active, self._loose)
+        wp.capture_if(state.flags.again, self._solve_again, tolerance=self._loose)
 
-    def _solve_for(self, mask: wp.array) -> None:
-        pot, state, settings, s = self.potential, self.state, self.settings, self.pcg.scalars
-        contacts = pot.collision.contacts
+    def _tighten(self) -> None:
+        """Continue the solves of steps that may be the last, and measure these again."""
+        pot, d = self.potential, self.state.decisions
+        tolerance = self.settings.linear_tolerance
+        self.state.flags.again.zero_()
+        self._iterate_linear(d.tightening, tolerance / self._loose)
+        wp.capture_if(self.state.flags.again, self._solve_again, tolerance=tolerance)
+        pot.size_of_step(d.tightening, d.size)
+
+    def _update_preconditioner(self, mask: wp.array) -> None:
+        pot, contacts = self.potential, self.potential.collision.contacts
         with self._stage("preconditioner"):
             self.preconditioner.update(pot.system, contacts, contacts.row.shape[1], mask)
+
+    def _iterate_linear(self, mask: wp.array, tolerance: float) -> None:
+        """Improve p by conjugate gradients until a share ``tolerance`` of the residual remains."""
+        pot, s = self.potential, self.pcg.scalars
         with self._stage("pcg"):
             self.pcg.solve(
-                *(pot.system, contacts, self.preconditioner, pot.residual, pot.p),
-                *(settings.linear_tolerance, settings.max_linear, mask),
+                *(pot.system, pot.collision.contacts, self.preconditioner, pot.residual, pot.p),
+                *(tolerance, self.settings.max_linear, mask),
             )
-        state.launch(decisions.after_solve, s.iterations, s.negative, mask)
+        self.state.launch(decisions.after_solve, s.iterations, s.negative, mask)
 
-    def _solve_again(self) -> None:
+    def _solve_again(self, tolerance: float) -> None:
         pot, again = self.potential, self.state.decisions.again
         pot.evaluate_elements(again)
         pot.fill_matrix(again)
         pot.launch(dynamics.restart, pot.p.shape, [pot.right_side, again], [pot.residual, pot.p])
-        self._solve_for(again)
+        self._update_preconditioner(again)
+        self._iterate_linear(again, tolerance)
 
     def _advance(self) -> None:
         """Move frames and unknowns together as far as gaps allow."""

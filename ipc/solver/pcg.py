@@ -161,13 +161,13 @@ class Pcg:
         max_iterations: int,
         active: wp.array,
     ) -> None:
-        """Solve H x = residual for active environments from x = 0; ``scalars`` has iterations.
+        """Add the solution of H δ = residual to x; ``scalars`` has iterations.
 
         Args:
             system, contacts: the matrix.
             preconditioner: already updated.
-            residual: right-hand side (B, N); overwritten by the residual.
-            x: solution (B, N); must be zero for the active environments.
+            residual: of x as it is (B, N); overwritten by the new one.
+            x: solution so far (B, N), zero at first.
             tolerance: on ‖r‖/‖r_0‖.
             max_iterations: after these the solution so far stands (it is a descent direction).
             active: mask (B,).

@@ -26,6 +26,7 @@ class Decisions:
     advancing: IntArray  # its frames advance in this iteration
     plain: IntArray  # takes an ordinary Newton step in this iteration
     again: IntArray  # solves again with a definite matrix
+    tightening: IntArray  # solves on, to the final tolerance
     shorten: IntArray  # still looks for the length of its advance
     attempts: IntArray  # at that length
     searching: IntArray  # still looks for the length of its Newton step
@@ -78,6 +79,7 @@ class Flags:
     average: IntArray
     advance: IntArray
     again: IntArray
+    tighten: IntArray
     shorten: IntArray
     plain: IntArray
     search: IntArray

@@ -250,7 +250,12 @@ def test_no_contacts_is_the_rest_inverse(rng: np.random.Generator) -> None:
 def press(preconditioner: str, steps: int = 4, max_contacts: int | None = None, **changes: object) -> tuple[np.ndarray, int, int]:
     """Positions after a press with a twist, and the Newton and PCG iterations it took."""
     ball = ipc.KinematicBody("ball", ipc.icosphere(4e-3, 2), ipc.Pose((1e-4, 2e-4, 4.12e-3)))
-    options: dict = {"d_hat": 1e-4, "friction": 0.5, "velocity_tolerance": 1e-7, "linear_tolerance": 1e-6} | changes
+    options: dict = {
+        "d_hat": 1e-4,
+        "friction": 0.5,
+        "velocity_tolerance": 1e-7,
+        "linear_tolerance": 1e-6,
+    } | changes
     settings = ipc.Settings(preconditioner=preconditioner, **options)  # pyright: ignore[reportArgumentType]
     world = ipc.World([bonded_pad(small_pad()), ball], settings, num_envs=2, device="cpu")
     if max_contacts is not None:
