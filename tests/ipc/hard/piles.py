@@ -180,7 +180,7 @@ def dominoes(setup: Setup, soft: bool) -> Worst:
     for k in range(count):
         mesh = moved(slab, (0, 0, 0), about((0, 1, 0), 0.25 if k == 0 else 0.0))
         bodies.append(solid(f"slab{k}", moved(mesh, (k * spacing, 0, NEAR - mesh.vertices[:, 2].min())), soft, 1e7))
-    world = world_of([*bodies, ipc.HalfSpace("floor")], setup, dt=0.005, friction=0.4, kappa=KAPPA, velocity_tolerance=1e-5)
+    world = world_of([*bodies, ipc.HalfSpace("floor")], setup, dt=0.005, friction=0.4, kappa=KAPPA, velocity_tolerance=2e-6)
     fell: list[int] = []
 
     def lean(name: str) -> float:
