@@ -86,6 +86,8 @@ def least_friction(corners: list[Floats]) -> float:
         corners: inner and outer corner at the first joint, then at the second, of each block [m], (4, 2).
     """
     blocks = len(corners)
+    size = max(float(np.abs(quad).max()) for quad in corners)
+    corners = [quad * (blocks**0.5 / size) for quad in corners]  # weights and arms of about one, as the solver's tolerances expect
 
     def balanced(friction: float) -> bool:
         unknowns = 3 * (blocks + 1)  # per joint: normal force at the inner and at the outer end, shear
@@ -117,15 +119,20 @@ def least_friction(corners: list[Floats]) -> float:
     return high
 
 
-def arch(setup: Setup, soft: bool, stands: bool) -> Worst:
-    """Seven voussoirs of half a round arch of 20 mm on the floor, without mortar, at 1.3 and 0.7 of the least μ of their geometry."""
-    meshes = voussoirs(7, 20e-3, 7e-3, 10e-3, NEAR)
-    ideal = voussoirs(7, 20e-3, 7e-3, 10e-3, 0.0)
+def profiles(blocks: list[ipc.TetMesh]) -> list[Floats]:
+    """Corners (4, 2) [m] of voussoirs, seen along y, as :func:`least_friction` takes them."""
     quads = []
-    for mesh in ideal:
-        v = mesh.vertices[np.isclose(mesh.vertices[:, 1], -5e-3)][:, [0, 2]]
+    for mesh in blocks:
+        v = mesh.vertices[mesh.vertices[:, 1] < 0][:, [0, 2]]
         angle, radius = np.arctan2(v[:, 1], v[:, 0]), np.linalg.norm(v, axis=1)
         quads.append(v[np.lexsort((radius, angle.round(6)))])
+    return quads
+
+
+def arch(setup: Setup, soft: bool, stands: bool) -> Worst:
+    """Seven voussoirs of half a round arch of 20 mm on the floor, without mortar, at 1.3 and 0.7 of the least μ of their geometry."""
+    shape = (7, 20e-3, 7e-3, 10e-3)
+    meshes, quads = voussoirs(*shape, NEAR), profiles(voussoirs(*shape, 0.0))
     friction = (1.3 if stands else 0.7) * least_friction(quads)
     bodies = [solid(f"block{k}", m, soft, 1e7) for k, m in enumerate(meshes)]
     world = world_of([*bodies, ipc.HalfSpace("floor")], setup, dt=0.005, friction=friction, kappa=KAPPA, velocity_tolerance=1e-5)
