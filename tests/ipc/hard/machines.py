@@ -13,7 +13,7 @@ import numpy as np
 
 import ipc
 from tests.ipc.hard.parts import ball, bolt, channel, cylinder, gear, knives, nut, points, ring, shifted, together
-from tests.ipc.hard.run import D_HAT, G, Setup, Worst, carries, mass, run, solid, world_of
+from tests.ipc.hard.run import D_HAT, FINE, G, Setup, Worst, carries, mass, run, solid, world_of
 from tests.ipc.hard.scenes import twisted
 from tests.ipc.hard.shapes import about, as_surface, bar, cube, moved
 
@@ -90,7 +90,7 @@ def soft_rollers(setup: Setup) -> Worst:
 
 
 def squeeze_out(setup: Setup) -> Worst:
-    """A plunger presses a soft block of 10 mm through a square nozzle of 6 mm: out it comes, of the same volume to 5 %."""
+    """A plunger presses a soft block of 10 mm through a square nozzle of 6 mm: what is out has its volume again, to 5 %."""
     block = moved(bar(10e-3, 12e-3, 10e-3, (4, 4, 5)), (0, 0, 6e-3 + 3e-4))
     tube = channel([(5.2e-3, 20e-3), (5.2e-3, 0.0), (3e-3, -5e-3), (3e-3, -8e-3)])
     bodies: list[ipc.Body] = [
@@ -102,16 +102,19 @@ def squeeze_out(setup: Setup) -> Worst:
     steps = 60
     worst = run(world, steps, lambda k: world.set_target("plunger", (0, 0, 14.6e-3 - 12e-3 * (k + 1) / steps)), driven=True)
     x = world.positions("block")[0]
-    volume = float(np.linalg.det(x[block.tets][:, 1:] - x[block.tets][:, :1]).sum() / 6) / (mass(block) / 1000)
-    worst.expect(x[:, 2].min() < -10e-3, f"it came to {x[:, 2].min():.3g} m only")
-    return worst.expect(abs(volume - 1) < 0.05, f"its volume is {volume:.3g} of that before")
+    out = block.tets[(x[block.tets][..., 2] < -9e-3).all(axis=1)]
+    now, rest = (float(np.linalg.det(v[out][:, 1:] - v[out][:, :1]).sum()) for v in (x, block.vertices))
+    worst.expect(x[:, 2].min() < -12e-3, f"it came to {x[:, 2].min():.3g} m only")
+    return worst.expect(
+        len(out) > 0 and abs(now / rest - 1) < 0.05, f"what is out has {now / max(rest, 1e-300):.3g} of its volume"
+    )
 
 
 def falls_on(setup: Setup, bed: ipc.TriMesh, soft: bool, mesh: ipc.TetMesh | None = None, young: float = 5e4) -> Worst:
     """A ball of 12 mm, or a mat, falls by a millimetre onto what is sharp; it carries the weight in the end."""
     mesh = mesh or moved(ball(6e-3), (0.3e-3, 0.2e-3, 7e-3))
     bodies = [solid("ball", mesh, soft, young), ipc.KinematicBody("bed", bed)]
-    worst = run(world_of(bodies, setup, friction=0.5, kappa=1e6, velocity_tolerance=1e-5), 60)
+    worst = run(world_of(bodies, setup, friction=0.5, kappa=1e6, velocity_tolerance=FINE), 90)
     return carries(worst, "bed", G * mass(mesh))
 
 
@@ -208,7 +211,7 @@ def peg(setup: Setup, soft: bool) -> Worst:
         ipc.KinematicBody("hole", walls),
         ipc.HalfSpace("bottom", ipc.Pose((0, 0, -8e-3))),
     ]
-    world = world_of(bodies, setup, d_hat=2e-5, friction=0.0, kappa=1e6, velocity_tolerance=1e-5)
+    world = world_of(bodies, setup, d_hat=2e-5, friction=0.0, kappa=1e6, velocity_tolerance=FINE)
     worst = run(world, 60)
     low = float(world.positions("peg")[0, :, 2].min())
     worst.expect(low < -7.9e-3, f"it came to {low:.3g} m only")
@@ -224,7 +227,7 @@ def wrecking_ball(setup: Setup) -> Worst:
             place = (0, 10e-3 * (column - 1 + 0.5 * (row % 2)), 3e-3 + 0.5 * D_HAT + row * (6e-3 + 0.95 * D_HAT))
             bodies.append(solid(f"brick{3 * row + column}", moved(brick, place), False))
     shot = solid("shot", moved(ball(5e-3, 3), (-9e-3, 1e-3, 9e-3)), False, density=5000.0)
-    world = world_of([*bodies, shot, ipc.HalfSpace("floor")], setup, dt=0.005, friction=0.4, kappa=1e6, velocity_tolerance=1e-5)
+    world = world_of([*bodies, shot, ipc.HalfSpace("floor")], setup, dt=0.005, friction=0.4, kappa=1e6, velocity_tolerance=FINE)
     world.set_velocity("shot", (2.0, 0.0, 0.0))
     worst = run(world, 40)
     hit = sum(float(world.positions(b.name)[0, :, 0].mean()) > 5e-3 for b in bodies)

@@ -14,7 +14,7 @@ from scipy.optimize import linprog
 
 import ipc
 from tests.ipc.hard.parts import ball, link, shifted, together, voussoirs
-from tests.ipc.hard.run import D_HAT, G, Setup, Worst, mass, run, solid, world_of
+from tests.ipc.hard.run import D_HAT, FINE, G, Setup, Worst, mass, run, solid, world_of
 from tests.ipc.hard.shapes import about, as_surface, bar, cube, moved, pyramid
 
 Floats = NDArray[np.float64]
@@ -68,7 +68,7 @@ def card_house(setup: Setup, soft: bool, stands: bool) -> Worst:
     """A house of seven cards. A card that leans by α needs μ > tan α / 2 below it if it carries nothing, and μ > tan α suffices."""
     bodies, lean = cards(soft)
     friction = 1.5 * math.tan(lean) if stands else 0.25 * math.tan(lean)
-    world = world_of([*bodies, ipc.HalfSpace("floor")], setup, friction=friction, kappa=KAPPA, velocity_tolerance=1e-5)
+    world = world_of([*bodies, ipc.HalfSpace("floor")], setup, friction=friction, kappa=KAPPA, velocity_tolerance=FINE)
     worst = run(world, 100 if stands else 50)
     most, sunk = _moved_most(world, bodies), _sunk(world, bodies)
     if stands:
@@ -87,7 +87,9 @@ def least_friction(corners: list[Floats]) -> float:
     """
     blocks = len(corners)
     size = max(float(np.abs(quad).max()) for quad in corners)
-    corners = [quad * (blocks**0.5 / size) for quad in corners]  # weights and arms of about one, as the solver's tolerances expect
+    corners = [
+        quad * (blocks**0.5 / size) for quad in corners
+    ]  # weights and arms of about one, as the solver's tolerances expect
 
     def balanced(friction: float) -> bool:
         unknowns = 3 * (blocks + 1)  # per joint: normal force at the inner and at the outer end, shear
@@ -135,7 +137,7 @@ def arch(setup: Setup, soft: bool, stands: bool) -> Worst:
     meshes, quads = voussoirs(*shape, NEAR), profiles(voussoirs(*shape, 0.0))
     friction = (1.3 if stands else 0.7) * least_friction(quads)
     bodies = [solid(f"block{k}", m, soft, 1e7) for k, m in enumerate(meshes)]
-    world = world_of([*bodies, ipc.HalfSpace("floor")], setup, dt=0.005, friction=friction, kappa=KAPPA, velocity_tolerance=1e-5)
+    world = world_of([*bodies, ipc.HalfSpace("floor")], setup, dt=0.005, friction=friction, kappa=KAPPA, velocity_tolerance=FINE)
     worst = run(world, 80)
     most, sunk = _moved_most(world, bodies), _sunk(world, bodies)
     if stands:
@@ -167,7 +169,7 @@ def tower(setup: Setup, soft: bool) -> Worst:
     size, count = 10e-3, 10
     meshes = [moved(cube(size), (0, 0, NEAR + k * (size + NEAR))) for k in range(count)]
     bodies = [solid(f"cube{k}", m, soft, 1e6) for k, m in enumerate(meshes)]
-    world = world_of([*bodies, ipc.HalfSpace("floor")], setup, friction=0.3, kappa=KAPPA, velocity_tolerance=1e-5)
+    world = world_of([*bodies, ipc.HalfSpace("floor")], setup, friction=0.3, kappa=KAPPA, velocity_tolerance=FINE)
     worst = run(world, 60)
     forces, weight = world.pressing(), G * mass(meshes[0])
     for k in range(count):
@@ -187,7 +189,7 @@ def dominoes(setup: Setup, soft: bool) -> Worst:
     for k in range(count):
         mesh = moved(slab, (0, 0, 0), about((0, 1, 0), 0.25 if k == 0 else 0.0))
         bodies.append(solid(f"slab{k}", moved(mesh, (k * spacing, 0, NEAR - mesh.vertices[:, 2].min())), soft, 1e7))
-    world = world_of([*bodies, ipc.HalfSpace("floor")], setup, dt=0.005, friction=0.4, kappa=KAPPA, velocity_tolerance=2e-6)
+    world = world_of([*bodies, ipc.HalfSpace("floor")], setup, dt=0.005, friction=0.4, kappa=KAPPA, velocity_tolerance=FINE)
     fell: list[int] = []
 
     def lean(name: str) -> float:
@@ -238,7 +240,7 @@ def steep(setup: Setup, soft: bool, holds: bool) -> Worst:
     body = solid("slab", slab, soft, 1e7)
     gravity = (G * math.sin(slope), 0.0, -G * math.cos(slope))
     world = world_of(
-        [body, ipc.HalfSpace("floor")], setup, friction=friction, gravity=gravity, kappa=KAPPA, velocity_tolerance=1e-5
+        [body, ipc.HalfSpace("floor")], setup, friction=friction, gravity=gravity, kappa=KAPPA, velocity_tolerance=FINE
     )
     speeds: list[float] = []
     worst = run(world, 40, lambda _: speeds.append(float(world.rigid_motion("slab").velocity[0, 0])))

@@ -17,6 +17,8 @@ D_HAT = 1e-4
 MAX_NEWTON = 200
 """Newton iterations a solve may take; a step is one solve, and up to two more as friction is renewed."""
 G = 9.81
+FINE = 1e-6
+"""Velocity tolerance [m/s] for light bodies on stiff barriers: there a force changes by its own size over a micrometre."""
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ def test_the_sign_of_det_f_is_exact() -> None:
     """Four points in a plane that no coordinate plane is: one rounding up or down decides, and float64 does not see it."""
     rest = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     a = np.array([0.1, 0.7, 0.3])
-    flat = np.array([a, a + 0.5, a + (0.25, 0.125, 0.5), a + (0.75, 0.625, 1.0)])
+    flat = np.array([a, a + 0.5, a + np.array([0.25, 0.125, 0.5]), a + np.array([0.75, 0.625, 1.0])])
     signs: list[float] = []
     for direction in (np.inf, -np.inf):
         now = flat.copy()
