@@ -155,7 +155,7 @@ def barrier_width(setup: Setup, d_hat: float, soft: bool) -> Worst:
     base = ipc.vertices_in_box(slab, (-1, -1, -2 * SIZE), (1, 1, -2 * SIZE))
     material = ipc.Material(1e6, 0.4)
     bodies = [solid("falling", mesh, soft, 1e6), ipc.SoftBody("slab", slab, material, bonded=base)]
-    world = world_of(bodies, setup, dt=0.02, d_hat=d_hat, friction=0.3, velocity_tolerance=min(1e-4, 0.02 * d_hat / 0.02))
+    world = world_of(bodies, setup, dt=0.02, d_hat=d_hat, friction=0.3, velocity_tolerance=1e-4 * d_hat / 0.02)
     worst = run(world, 60)
     gap = float(world.contacts().gap.max(initial=0.0))
     worst.expect(0 < gap < d_hat, f"its contacts are up to {gap:.3g} m wide")

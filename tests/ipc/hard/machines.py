@@ -122,7 +122,7 @@ def compactor(setup: Setup, kinds: str) -> Worst:
     """Cubes and balls in a box whose four walls and lid close in: soft ones are pressed together, hard ones stop the walls."""
     bodies: list[ipc.Body] = []
     for k in range(8):
-        mesh = ball(4.5e-3, 3) if k % 2 else cube(8e-3, 2)
+        mesh = ball(4e-3, 3) if k % 2 else cube(6e-3, 2)
         mesh = moved(moved(mesh, tuple(-mesh.vertices.mean(axis=0))), (0, 0, 0), about((1, 2, 3), 0.4 * k))
         place = 10e-3 * (np.array([k % 2, k // 2 % 2, k // 4]) - 0.5)
         soft = kinds == "soft" or (kinds == "mixed" and k not in (0, 7))
@@ -130,7 +130,7 @@ def compactor(setup: Setup, kinds: str) -> Worst:
             bodies.append(ipc.SoftBody(f"body{k}", moved(mesh, tuple(place)), ipc.Material(5e4, 0.4), self_contact=True))
         else:
             bodies.append(solid(f"body{k}", moved(mesh, tuple(place)), False))
-    start, end = 11.5e-3, {"soft": 8e-3, "mixed": 8.6e-3, "affine": 7e-3}[kinds]
+    start, end = 11.5e-3, {"soft": 6.6e-3, "mixed": 7.2e-3, "affine": 5e-3}[kinds]
     walls = []
     for axis in range(3):
         for side in (-1, 1):
