@@ -15,7 +15,7 @@ never rises.
 Sources: Erleben 2018, "Methodology for Assessing Mesh-Based Contact Point Methods"; Li et al. 2020, "Incremental Potential Contact";
 Ferguson et al. 2021, "Intersection-free Rigid Body Dynamics"; Lan et al. 2022, "Affine Body Dynamics".
 
-Writes metrics.json and hard_cases.png, the last state of each case.
+Writes metrics.json and a picture of the last states of each group of cases, hard_cases_GROUP.png.
 """
 
 from __future__ import annotations
@@ -31,11 +31,12 @@ from experiments.running import recorded, run
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io import CommonOptions, Metric
-from tests.ipc.hard.cases import CASES
+from tests.ipc.hard.cases import CASES, GROUPS
 from tests.ipc.hard.run import Setup, Worst
 from tests.ipc.hard.scenes import random_presses
 
 PRESSES = "random_presses"
+PICTURES = tuple(f"hard_cases_{group}.png" for group in GROUPS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +94,7 @@ def main(args: Args) -> dict[str, Metric]:
 
     names, device = chosen(args.cases), resolve_device(args.device, ray_tracing=False)
     setup, results = Setup(device, args.large), dict[str, Worst]()
-    with recorded(args, "hard_cases", device=device, owned=("hard_cases.png",), packages=("warp-lang", "ipctk")) as (
+    with recorded(args, "hard_cases", device=device, owned=PICTURES, packages=("warp-lang", "ipctk")) as (
         folder,
         metrics,
     ):
@@ -113,7 +114,14 @@ def main(args: Args) -> dict[str, Metric]:
             )
         failing = [name for name, worst in results.items() if not worst.passed()]
         metrics |= {"cases.passed": len(names) - len(failing), "cases.total": len(names), "cases.failing": " ".join(failing)}
-        draw_last_states({n: state_of(worst.world) for n, worst in results.items() if worst.world}, folder / "hard_cases.png")
+        for group, picture in zip(GROUPS.values(), PICTURES, strict=True):
+            drawn = {
+                n: state_of(w.world)
+                for n, w in results.items()
+                if w.world and (n in group or (n == PRESSES and group is GROUPS["basic"]))
+            }
+            if drawn:
+                draw_last_states(drawn, folder / picture)
     if failing:
         sys.exit(f"{len(failing)} of {len(names)} fail: {' '.join(failing)}")
     return metrics

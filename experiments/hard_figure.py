@@ -37,10 +37,17 @@ LIGHT = np.array([-0.3, -0.55, 0.78])
 VIEWS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("spike_in_hole", "spike_in_crack", "wedge_in_crack"), (32, -58)),
     **dict.fromkeys(("mass_ratio_1e4", "crush"), (-3, -62)),
+    **dict.fromkeys(("gears_soft", "gears_affine", "heap_of_30"), (50, -70)),
+    **dict.fromkeys(("rollers_draw_in", "rollers_slip", "rollers_coated"), (12, -75)),
 }
 """Elevation and azimuth [deg] where the usual ones show little."""
 USUAL_VIEW = (20, -62)
-SEE_THROUGH = ("spike_in_hole", "spike_in_crack", "wedge_in_crack", "slotted_tetrahedron", "squeeze_and_release", "blocked_drive")
+SEE_THROUGH = (
+    *("spike_in_hole", "spike_in_crack", "wedge_in_crack", "slotted_tetrahedron", "squeeze_and_release", "blocked_drive"),
+    *("heap_of_30", "squeeze_out", "trash_compactor_soft", "trash_compactor_mixed", "trash_compactor_affine"),
+    *("nut_and_bolt_soft", "nut_and_bolt_affine", "peg_in_hole_soft", "peg_in_hole_affine"),
+    *("squeezed_nu_0495", "squeezed_nu_0499"),
+)
 INSETS = {"mass_ratio_1e4": "lower", "crush": "lower"}
 """Bodies that are too small to be seen beside the others of their case; they are drawn once more."""
 PIECES = 20
@@ -123,7 +130,8 @@ def draw_last_states(states: Mapping[str, State], path: Path) -> None:
 
 def _title(name: str) -> str:
     """A case's name in words: ``dt_10ms`` is dt 10 ms."""
-    return re.sub(r"(\d)(m?s)$", r"\1 \2", name.replace("_", " ").replace("1e4", "10⁴"))
+    words = name.replace("_", " ").replace("1e4", "10⁴").replace("nu 0", "ν 0.").replace("mu 5", "μ 5").replace("d hat", "d̂")
+    return re.sub(r"(\d)(nm|um|mm|ms|s)\b", r"\1 \2", words).replace(" um", " µm")
 
 
 def _traction_text(pascal: float) -> str:

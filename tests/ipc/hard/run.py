@@ -147,8 +147,10 @@ class Mechanics:
             forces, mass = self._world.contact_forces(name)[0], self._motion[name].mass
             change = mass * (self._motion[name].velocity[0] - before[name].velocity[0]) / self._world.settings.dt
             missing = float(np.linalg.norm(change - mass * self._gravity - forces.sum(axis=0)))
-            self._size = max(self._size, float(np.linalg.norm(forces, axis=1).sum() + mass * np.linalg.norm(self._gravity)))
-            self.force_error = max(self.force_error, missing / self._size if missing else 0.0)
+            least = mass * settings.velocity_tolerance / settings.dt  # what the tolerance leaves open where nothing acts yet
+            weight = mass * float(np.linalg.norm(self._gravity))
+            self._size = max(self._size, least, float(np.linalg.norm(forces, axis=1).sum()) + weight)
+            self.force_error = max(self.force_error, missing / self._size)
         if not self._driven and rise > 0:
             self.energy_rise = max(self.energy_rise, rise / self._kinetic)
 
