@@ -25,7 +25,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import LinearSegmentedColormap, PowerNorm
 from matplotlib.patches import Rectangle
 
-__all__ = ["State", "draw_last_states", "state_of"]
+__all__ = ["State", "draw_last_states", "load_state", "save_state", "state_of"]
 
 Floats = NDArray[np.floating]
 
@@ -105,6 +105,22 @@ def state_of(world: ipc.World) -> State:
             traction = np.linalg.norm(world.traction(body.name)[0], axis=-1)[faces].mean(axis=1)
         surfaces.append(Surface(body.name, np.asarray(x[faces]), traction))
     return State(tuple(surfaces), floor)
+
+
+def save_state(state: State, path: Path) -> None:
+    """Keep a state in an ``.npz`` file."""
+    arrays = {f"triangles_{s.name}": s.triangles for s in state.surfaces}
+    arrays |= {f"traction_{s.name}": s.traction for s in state.surfaces if s.traction is not None}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(path, **arrays, **({} if state.floor is None else {"floor": np.array(state.floor)}))
+
+
+def load_state(path: Path) -> State:
+    """State that :func:`save_state` kept."""
+    with np.load(path) as file:
+        names = [key.removeprefix("triangles_") for key in file if key.startswith("triangles_")]
+        surfaces = tuple(Surface(n, file[f"triangles_{n}"], file.get(f"traction_{n}")) for n in names)
+        return State(surfaces, float(file["floor"]) if "floor" in file else None)
 
 
 def draw_last_states(states: Mapping[str, State], path: Path) -> None:
