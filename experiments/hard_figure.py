@@ -112,7 +112,9 @@ def save_state(state: State, path: Path) -> None:
     arrays = {f"triangles_{s.name}": s.triangles for s in state.surfaces}
     arrays |= {f"traction_{s.name}": s.traction for s in state.surfaces if s.traction is not None}
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(path, **arrays, **({} if state.floor is None else {"floor": np.array(state.floor)}))
+    if state.floor is not None:
+        arrays["floor"] = np.array(state.floor)
+    np.savez_compressed(path, allow_pickle=False, **arrays)
 
 
 def load_state(path: Path) -> State:

@@ -7,13 +7,29 @@ from dataclasses import replace
 import pytest
 
 import ipc
-from tests.ipc.hard.cases import CASES
+from tests.ipc.hard.cases import CASES, GROUPS
 from tests.ipc.hard.run import MAX_NEWTON, Mechanics, Setup, Worst
 from tests.ipc.hard.scenes import SOFT, random_presses
 from tests.ipc.hard.shapes import cube
 
 SLOW = ["crush", "beam_twist", "mat_twist", "squeeze_and_release", "edge_alignment", "wedge_out_of_crack"]
-"""Those that take longer than some two seconds."""
+"""Basic cases that take longer than some two seconds."""
+QUICK = [
+    *(name for name in GROUPS["basic"] if name not in SLOW),
+    *(
+        "steep_slope_holds_soft",
+        "steep_slope_holds_affine",
+        "steep_slope_slides_soft",
+        "steep_slope_slides_affine",
+        "chain_affine",
+    ),
+    *("peg_in_hole_affine", "needle_nu_0495", "d_hat_1um_soft", "d_hat_1um_affine", "d_hat_1mm_soft"),
+    *("start_gap_1nm_soft", "start_gap_1nm_affine", "start_gap_1nm_soft_on_affine"),
+]
+FAILING = {
+    "d_hat_1mm_affine": "one landing: friction renewed 30 times still changes by 13 %; the changes shrink by 3 % each",
+}
+"""Cases that the solver does not pass, with the cause. A test here that passes fails: take it off the list then."""
 SETUP = Setup()
 FALL = ipc.Settings(gravity=(0.0, 0.0, -9.81))
 
@@ -26,15 +42,23 @@ def check(name: str, worst: Worst, most: int = MAX_NEWTON) -> None:
     assert worst.max_newton <= most, said
 
 
-@pytest.mark.parametrize("name", [n for n in CASES if n not in SLOW])
+@pytest.mark.parametrize("name", QUICK)
 def test_quick_cases_pass(name: str) -> None:
     check(name, CASES[name](SETUP))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SLOW)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.xfail(reason=FAILING[name], strict=True)) if name in FAILING else name
+        for name in CASES
+        if name not in QUICK
+    ],
+)
 def test_slow_cases_pass(name: str) -> None:
-    check(name, CASES[name](SETUP))
+    """Those that renew friction often take several solves a step."""
+    check(name, CASES[name](SETUP), most=MAX_NEWTON if name in GROUPS["basic"] else 5 * MAX_NEWTON)
 
 
 @pytest.mark.slow

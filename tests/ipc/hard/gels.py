@@ -9,7 +9,7 @@ import numpy as np
 
 import ipc
 from tests.ipc.hard.run import D_HAT, G, Setup, Worst, carries, mass, run, solid, world_of
-from tests.ipc.hard.shapes import SIZE, about, as_surface, cube, moved, pyramid
+from tests.ipc.hard.shapes import SIZE, about, as_surface, cube, moved, pyramid, then
 
 THICK = 4e-3
 """Thickness of the pads [m]."""
@@ -63,12 +63,10 @@ def pad_rim(setup: Setup, tool: ipc.TriMesh, at: tuple[float, float], driven: bo
 def gel_on_gel(setup: Setup, cells: tuple[int, int, int], angle: float) -> Worst:
     """Two pads face to face, pressed by 0.3 mm and sheared by 3 mm: they act on each other alike, and slide at μ."""
     friction, material = 0.5, ipc.Material(1e5, 0.45)
-    over = np.array(about((1, 0, 0), math.pi))
-    a, b = about((0, 0, 1), angle), over
-    turn = (a[0] * b[0] - a[1:] @ b[1:], *(a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])))
+    turn = then(about((1, 0, 0), math.pi), about((0, 0, 1), angle))
     bodies: list[ipc.Body] = [
         pad("low", material),
-        pad("high", material, cells, ipc.Pose((0, 0, 2e-4), tuple(float(q) for q in turn))),
+        pad("high", material, cells, ipc.Pose((0, 0, 2e-4), turn)),
     ]
     world = world_of(bodies, setup, gravity=(0, 0, 0), friction=friction, velocity_tolerance=1e-5)
     ratios: list[float] = []

@@ -15,17 +15,10 @@ import ipc
 from tests.ipc.hard.parts import ball, bolt, channel, cylinder, gear, knives, nut, points, ring, shifted, together
 from tests.ipc.hard.run import D_HAT, FINE, G, Setup, Worst, carries, mass, run, solid, world_of
 from tests.ipc.hard.scenes import twisted
-from tests.ipc.hard.shapes import about, as_surface, bar, cube, moved
+from tests.ipc.hard.shapes import about, as_surface, bar, cube, moved, then
 
 ALONG_Y = about((1, 0, 0), -0.5 * math.pi)
 """Turns the z axis onto the y axis."""
-
-
-def _turned(angle: float, first: np.ndarray) -> np.ndarray:
-    """The quaternion of ``first`` and then a turn by ``angle`` about the y axis."""
-    a, b = about((0, 1, 0), angle), first
-    w, v = a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
-    return np.array([w, *v])
 
 
 def rollers(setup: Setup, friction: float) -> Worst:
@@ -48,7 +41,7 @@ def rollers(setup: Setup, friction: float) -> Worst:
 
     def turn(k: int) -> None:
         for name, side in (("left", 1), ("right", -1)):
-            world.set_target(name, rotation=_turned(side * speed * 0.01 * (k + 1), ALONG_Y))
+            world.set_target(name, rotation=then(ALONG_Y, about((0, 1, 0), side * speed * 0.01 * (k + 1))))
 
     worst = run(world, 90, turn, driven=True)
     x = world.positions("block")[0]
@@ -79,7 +72,7 @@ def soft_rollers(setup: Setup) -> Worst:
         close = min(k + 1, 10) / 10 * 1.5e-3
         for name, side in (("low", -1), ("high", 1)):
             angle = side * speed * 0.01 * max(0, k - 9)
-            world.set_target(name, (0, 0, side * (middle + 1e-3 - close)), _turned(angle, ALONG_Y))
+            world.set_target(name, (0, 0, side * (middle + 1e-3 - close)), then(ALONG_Y, about((0, 1, 0), angle)))
         places.append(float(world.positions("bar")[0, :, 0].mean()))
 
     worst = run(world, 70, turn, driven=True)

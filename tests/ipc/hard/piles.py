@@ -175,7 +175,7 @@ def tower(setup: Setup, soft: bool) -> Worst:
     for k in range(count):
         below = "floor" if k == 0 else f"cube{k - 1}"
         pair = (f"cube{k}", below)
-        carried = forces[pair].wrench[0, 2] if pair in forces else -forces[pair[::-1]].wrench[0, 2]
+        carried = forces[pair].wrench[0, 2] if pair in forces else -forces[below, pair[0]].wrench[0, 2]
         worst.expect(
             abs(carried / ((count - k) * weight) - 1) < 0.02, f"{below} carries {carried:.4g} N of {(count - k) * weight:.4g} N"
         )
