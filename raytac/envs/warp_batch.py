@@ -86,7 +86,7 @@ class WarpBatch:
         launches: int | None = None,
         contacts: int | None = None,
         rows: int | None = None,
-        patches: int = 8,
+        patches: int = 16,
     ) -> None:
         """Make the worlds; ``reset`` begins the episodes.
 

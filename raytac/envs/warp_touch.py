@@ -42,7 +42,7 @@ class WarpTouch:
         *,
         pitch: float,
         generator: torch.Generator,
-        patches: int = 8,
+        patches: int = 16,
     ) -> None:
         """Make the arrays.
 

@@ -29,7 +29,7 @@ class DeviceFots:
     """
 
     def __init__(
-        self, sensor: SensorSpec, config: MarkersConfig, grid: PadGrid, *, num_envs: int, patches: int = 8, device: str = "cpu"
+        self, sensor: SensorSpec, config: MarkersConfig, grid: PadGrid, *, num_envs: int, patches: int = 16, device: str = "cpu"
     ) -> None:
         """Make the arrays.
 

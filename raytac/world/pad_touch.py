@@ -36,7 +36,7 @@ class PadTouch:
         gels: Sequence[tuple[Sequence[Part], float]] = (),
         pad: int,
         num_envs: int,
-        patches: int = 8,
+        patches: int = 16,
         device: str = "cpu",
     ) -> None:
         """Make the arrays.

@@ -17,7 +17,7 @@ pytest.importorskip("torch")
 import torch
 import warp as wp
 
-from raytac.envs import SCRIPTED, BalancePole, LiftCube, OpenDrawer, PushCube, RollBall, Task, TaskBatch, WarpBatch
+from raytac.envs import SCRIPTED, BalancePole, InsertPeg, LiftCube, OpenDrawer, PushCube, RollBall, Task, TaskBatch, WarpBatch
 from raytac.errors import InputError
 from raytac.markers import MarkerPerturbation
 from raytac.observe import MODALITIES, ObservationSettings, Randomization
@@ -213,7 +213,7 @@ def test_what_is_not_on_the_device_is_refused() -> None:
 
 @pytest.mark.gpu
 @pytest.mark.slow
-@pytest.mark.parametrize("task", [PushCube, BalancePole, LiftCube, RollBall])
+@pytest.mark.parametrize("task", [PushCube, BalancePole, LiftCube, RollBall, InsertPeg, OpenDrawer])
 def test_a_million_random_steps_stay_finite_and_bounded(task: type[Task]) -> None:
     """Environments that fail are marked and begin again; nothing that is observed grows."""
     batch = WarpBatch(task(), num_envs=2048, tactile=("markers", "wrench"), device="cuda", contacts=40, rows=200)

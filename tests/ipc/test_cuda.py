@@ -15,7 +15,7 @@ pytestmark = pytest.mark.gpu
 def press(device: str, num_envs: int) -> ipc.World:
     radius = 4e-3
     ball = ipc.KinematicBody("ball", ipc.icosphere(radius, 2), ipc.Pose((1e-4, 2e-4, radius + 1.2e-4)))
-    settings = ipc.Settings(d_hat=1e-4, friction=0.5, velocity_tolerance=1e-9, linear_tolerance=1e-8, friction_relags=1)
+    settings = ipc.Settings(d_hat=1e-4, friction=0.5, velocity_tolerance=1e-9, linear_tolerance=1e-8)
     world = ipc.World([bonded_pad(small_pad()), ball], settings, num_envs=num_envs, device=device)
     depth = np.linspace(0.3e-3, 0.6e-3, 4)[:num_envs]
     for k in range(1, 7):

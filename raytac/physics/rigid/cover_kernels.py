@@ -255,7 +255,7 @@ def add_outline(
         j += wp.block_dim() // across()
     if total_of(edges) == 0:
         return
-    j = wp.max(lane // across() - 1, -j0)
+    j = lane // across() - 1
     while j < wp.min(ny, last_y - j0):
         i = lane % across() - 1
         while i < nx:
@@ -274,7 +274,7 @@ def add_outline(
             inside = wp.int32(0)
             for m in range(4):
                 inside += wp.where(corners[m] < below, 1, 0)
-            if inside > 0 and inside < 4 and i0 + i >= 0 and i0 + i < last_x:
+            if inside > 0 and inside < 4 and i0 + i >= 0 and i0 + i < last_x and j0 + j >= 0:
                 steep, share, sharp = wp.vec4d(), wp.vec4d(_HALF, _HALF, _HALF, _HALF), wp.int32(0)
                 for m in range(4):
                     one, two = corners[m], corners[(m + 1) % 4]
