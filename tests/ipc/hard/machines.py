@@ -220,7 +220,7 @@ def wrecking_ball(setup: Setup) -> Worst:
             place = (0, 10e-3 * (column - 1 + 0.5 * (row % 2)), 3e-3 + 0.5 * D_HAT + row * (6e-3 + 0.95 * D_HAT))
             bodies.append(solid(f"brick{3 * row + column}", moved(brick, place), False))
     shot = solid("shot", moved(ball(5e-3, 3), (-9e-3, 1e-3, 9e-3)), False, density=5000.0)
-    world = world_of([*bodies, shot, ipc.HalfSpace("floor")], setup, dt=0.005, friction=0.4, kappa=1e6, velocity_tolerance=FINE)
+    world = world_of([*bodies, shot, ipc.HalfSpace("floor")], setup, dt=0.005, friction=0.4, kappa=1e6, velocity_tolerance=1e-5)
     world.set_velocity("shot", (2.0, 0.0, 0.0))
     worst = run(world, 40)
     hit = sum(float(world.positions(b.name)[0, :, 0].mean()) > 5e-3 for b in bodies)
