@@ -28,6 +28,8 @@ QUICK = [
 ]
 FAILING = {
     "dominoes_soft": "from 15 renewals of friction on only the sum of its limits has to settle: one step's forces are 6 % off balance",
+    "mat_twist_10_turns": "the mat snaps: in 2 of 160 steps a solve takes up its 200 Newton iterations",
+    "trash_compactor_mixed": "one step: friction of affine bodies that are hardly pressed does not settle in 30 renewals",
     "d_hat_1mm_affine": "one landing: friction renewed 30 times still changes by 13 %; the changes shrink by 3 % each",
 }
 """Cases that the solver does not pass, with the cause. A test here that passes fails: take it off the list then."""

@@ -228,9 +228,9 @@ def wrecking_ball(setup: Setup) -> Worst:
 
 
 def many_turns(setup: Setup) -> Worst:
-    """A mat of 40 × 8 × 0.6 mm twisted by ten whole turns, without friction."""
+    """A mat of 40 × 8 × 0.6 mm twisted by ten whole turns."""
     mesh = bar(8e-3, 0.6e-3, 40e-3, (20, 4, 1))
-    return twisted(setup, mesh, 10, 40e-3, friction=0.0)
+    return twisted(setup, mesh, 10, 40e-3)
 
 
 def _both(name: str, case: Callable[[Setup, bool], Worst]) -> dict[str, Callable[[Setup], Worst]]:

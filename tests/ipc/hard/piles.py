@@ -216,14 +216,14 @@ def heap(setup: Setup) -> Worst:
         mesh = moved(mesh, tuple(-mesh.vertices.mean(axis=0)))
         mesh = moved(mesh, (0, 0, 0), about(tuple(axis), rng.uniform(0, math.pi)))
         place = 9.5e-3 * (np.array([k % 3, k // 3 % 3, k // 9]) - (1, 1, 0)) + (0, 0, 7e-3) + rng.uniform(-2e-4, 2e-4, 3)
-        bodies.append(solid(f"body{k}", moved(mesh, tuple(place)), k % 8 < 4, 1e5))
+        bodies.append(solid(f"body{k}", moved(mesh, tuple(place)), k % 8 < 4, 1e5, stiffness=1e6))
     half, high = (side + wall) / 2, 60e-3
     box = together(
         *(shifted(ipc.box_surface((wall, side + 2 * wall, high)), (s * half, 0, high / 2)) for s in (-1, 1)),
         *(shifted(ipc.box_surface((side + 2 * wall, wall, high)), (0, s * half, high / 2)) for s in (-1, 1)),
     )
-    world = world_of([*bodies, ipc.KinematicBody("box", box), ipc.HalfSpace("floor")], setup, dt=0.02, friction=0.3, kappa=1e5)
-    worst = run(world, 30)
+    world = world_of([*bodies, ipc.KinematicBody("box", box), ipc.HalfSpace("floor")], setup, dt=0.005, friction=0.3, kappa=1e5)
+    worst = run(world, 60)
     x = np.concatenate([world.positions(b.name)[0] for b in bodies])
     worst.expect((np.abs(x[:, :2]) < side / 2).all() and (x[:, 2] > 0).all(), "something is out of the box")
     motion = [world.rigid_motion(b.name) for b in bodies]

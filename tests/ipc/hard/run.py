@@ -179,11 +179,18 @@ def world_of(bodies: list[ipc.Body], setup: Setup, **settings: Any) -> ipc.World
     return ipc.World(bodies, ipc.Settings(**(options | settings)), device=setup.device)
 
 
-def solid(name: str, mesh: ipc.TetMesh, soft: bool, young: float = 1e6, density: float = 1000.0, drive: float = 0.0) -> ipc.Body:
-    """The same tetrahedra as a soft body, or as an affine one."""
+def solid(
+    name: str,
+    mesh: ipc.TetMesh,
+    soft: bool,
+    young: float = 1e6,
+    density: float = 1000.0,
+    stiffness: float = 1e8,
+) -> ipc.Body:
+    """The same tetrahedra as a soft body of that Young's modulus [Pa], or as an affine one of that stiffness [Pa]."""
     if soft:
         return ipc.SoftBody(name, mesh, ipc.Material(young, 0.4, density))
-    return ipc.AffineBody(name, as_surface(mesh), ipc.Stiff(density=density), drive=drive)
+    return ipc.AffineBody(name, as_surface(mesh), ipc.Stiff(stiffness, density))
 
 
 def mass(mesh: ipc.TetMesh, density: float = 1000.0) -> float:
