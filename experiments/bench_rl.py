@@ -1,4 +1,4 @@
-"""How many environment steps a second? Push cube, rigid pad, by what is observed; the time split into physics, observation and policy.
+"""How many environment steps a second? Push cube, by what is observed; the time split into physics, observation and policy.
 
     python experiments/bench_rl.py --out runs/bench_rl
     python experiments/bench_rl.py --envs 16 --modes fots,table32 --steps 40
@@ -6,6 +6,8 @@
     python experiments/bench_rl.py --envs 4096 --modes none,fots,table32 --device cuda --out runs/bench_rl_warp
     python experiments/bench_rl.py --envs 4096 --modes fots --device cuda --gpus 2 --out runs/bench_rl_two
     python experiments/bench_rl.py --frames --envs 512 --device cuda --out runs/bench_rl_cuda
+    python experiments/bench_rl.py --physics ipc --envs 2 --steps 9 --out runs/bench_rl_soft
+    python experiments/bench_rl.py --physics ipc --task RollBall --envs 2 --steps 9 --out runs/bench_rl_soft_roll
 
 Modes: ``none`` (no touch), ``fots`` (9 x 11 marker displacements), ``touch`` (these and the wrench), ``table32`` (32 x 32 images of the
 Taxim table), ``raytrace64`` (64 x 64 ray-traced images), ``raytrace320`` (320 x 240 of these). The policy is the multilayer perceptron
@@ -20,6 +22,12 @@ of both figures, ``name`` being the commit, and ``.speedup_least`` and ``.speedu
 
 With ``--device cuda`` worlds are those of MuJoCo Warp and all stays on the device, the policy in PyTorch too; keys begin with ``gpu.``
 and times are the mean over steps, since nothing waits in between.
+
+With ``--physics ipc`` pads are soft, of ``--task``, and nothing is observed if no mode is named. Keys are ``cpu.push.ipc.<key>`` (``gpu.``
+where the solver runs on CUDA; ``roll`` for RollBall), with the mode before the last part if it is not ``none``. Besides the speed they say
+what an environment takes in a control step on average: ``solves`` of the contact solver, its ``newton`` iterations and the ``linear``
+iterations of their conjugate gradients; and ``asleep``, in which share of the steps it was not solved at all. ``approach.<key>`` is of the
+first third of as many steps more, until the pad is on the body.
 
 ``--frames`` leaves physics out: how many images of ``--size`` a second of ``--envs`` pads that are pressed, each differently? The gel's
 heights are on the device when the clock starts; cut, difference to rest and hand-over to PyTorch (DLPack) are in the time, and the image
@@ -43,7 +51,7 @@ import numpy as np
 from experiments.running import recorded, run
 from raytac.checks import check_known, check_whole
 from raytac.device import resolve_device
-from raytac.envs import PushCubeVectorEnv
+from raytac.envs import PushCubeVectorEnv, RollBallVectorEnv
 from raytac.errors import InputError, RaytacError
 from raytac.gel import ElasticSurround, GelSurface
 from raytac.io import CommonOptions, Metric, parse_names, parse_resolution, read_metrics, versions
@@ -62,6 +70,8 @@ MODES: dict[str, ObservationSettings | None] = {
 }
 
 
+TASKS = {"PushCube": ("push", PushCubeVectorEnv), "RollBall": ("roll", RollBallVectorEnv)}
+"""Tasks with soft pads: the name in keys, and the vector of environments."""
 TIMED = ("fots", "table32", "raytrace64")
 """Modes that are timed if none is named."""
 ENGINES = ("auto", "mujoco", "mujoco_warp")
@@ -78,8 +88,12 @@ class Args(CommonOptions):
 
     envs: int = 16
     """Number of environments."""
+    physics: str = "rigid"
+    """Pads: rigid or ipc."""
+    task: str = "PushCube"
+    """PushCube or RollBall, the latter with soft pads only."""
     modes: str = ""
-    """What is observed, joined by commas; fots, table32 and raytrace64, or with ``--frames`` all, if empty."""
+    """What is observed, joined by commas; fots, table32 and raytrace64, with ``--frames`` all, with ``--physics ipc`` none, if empty."""
     steps: int = 60
     """Steps, or calls with ``--frames``, that are timed, after a third as many to press the pad on or to record the kernels."""
     frames: bool = False
@@ -102,6 +116,10 @@ class Args(CommonOptions):
 
 def main(args: Args) -> dict[str, Metric]:
     """Run all and write ``metrics.json``."""
+    check_known("physics", args.physics, ("rigid", "ipc"))
+    check_known("task", args.task, tuple(TASKS) if args.physics == "ipc" else ("PushCube",))
+    if args.physics == "ipc":
+        return soft(args)
     known = tuple(FRAMES) if args.frames else tuple(MODES)
     if args.against is not None:
         return compare(args, parse_names(args.modes or ",".join((*TIMED, BALL)), "modes", (*MODES, BALL)))
@@ -124,6 +142,53 @@ def main(args: Args) -> dict[str, Metric]:
                 metrics |= {f"{where}push.{name}.{key}": value for key, value in found.items()}
                 print(f"{name}: {metrics[f'{where}push.{name}.env_steps_per_s']:.0f} environment steps/s", flush=True)
     return metrics
+
+
+def soft(args: Args) -> dict[str, Metric]:
+    """Run all modes with soft pads and write ``metrics.json``."""
+    for name, given in (("frames", args.frames), ("against", args.against is not None), ("gpus", args.gpus > 1)):
+        if given:
+            raise InputError(name, value=getattr(args, name), rule="is for rigid pads, not for --physics ipc")
+    check_known("engine", args.engine, ("auto", "mujoco"))
+    names, device = parse_names(args.modes or "none", "modes", tuple(MODES)), resolve_device(args.device)
+    with recorded(args, "bench_rl", device=device, owned=("metrics.json",), packages=("gymnasium",)) as (_, metrics):
+        metrics |= {"envs": args.envs, "steps": args.steps, **machine()}
+        for name in names:
+            prefix = f"{'gpu' if device == 'cuda' else 'cpu'}.{TASKS[args.task][0]}.ipc"
+            mode = prefix if name == "none" else f"{prefix}.{name}"
+            metrics |= {f"{mode}.{key}": value for key, value in timed_soft(MODES[name], args).items()}
+            print(f"{mode}: {metrics[f'{mode}.env_steps_per_s']:.2f} environment steps/s", flush=True)
+    return metrics
+
+
+def timed_soft(tactile: ObservationSettings | None, args: Args) -> dict[str, Metric]:
+    """Keys of one mode with soft pads."""
+    env = TASKS[args.task][1](args.envs, physics="ipc", tactile=tactile, seed=args.seed, device=args.device)
+    env.reset(seed=args.seed)
+    rng, actions = np.random.default_rng(args.seed), env.single_action_space.shape[0]  # type: ignore[index]
+    rows = []
+    for _ in range(args.steps // 3 + args.steps):
+        before = dict(env.batch.time_s)
+        force = -env.batch.world.state().wrench["sensor"][:, 2]
+        action = rng.uniform(-0.1, 0.1, (args.envs, actions))
+        action[:, 2] = np.clip(0.3 * (force - 1.0), -1.0, 1.0)
+        began = time.perf_counter()
+        env.step(action)
+        wall, state = time.perf_counter() - began, env.batch.world.state()
+        counts = [float(np.mean(state.report[name])) for name in ("substeps", "newton", "linear")]
+        asleep = float(np.mean(np.asarray(state.report["substeps"]) == 0))
+        spent = [env.batch.time_s[name] - before[name] for name in ("physics", "observation")]
+        rows.append((wall, *counts, asleep, float((force > 0.0).mean()), float(state.failed.mean()), *spent))
+
+    def summary(values: np.ndarray) -> dict[str, Metric]:
+        names = ("solves", "newton", "linear", "asleep", "in_contact", "failed")
+        found: dict[str, Metric] = dict(zip(names, values[:, 1:7].mean(axis=0).tolist(), strict=True))
+        times = dict(zip(("physics_ms", "observation_ms"), (1e3 * values[:, 7:].mean(axis=0)).tolist(), strict=True))
+        return {"env_steps_per_s": args.envs * len(values) / float(values[:, 0].sum()), **found, **times}
+
+    table = np.array(rows)
+    approach, pressed = (summary(part) for part in np.split(table, [args.steps // 3]))
+    return pressed | {f"approach.{key}": value for key, value in approach.items()}
 
 
 def compare(args: Args, names: Sequence[str]) -> dict[str, Metric]:

@@ -25,7 +25,7 @@ class FlatPolicy:
     """Deterministic actions (B, k) from the observation ``actor`` (B, n) of a ``FlatVector``.
 
     Attributes:
-        task, touch, history: what it was trained with, in the words of ``train_gpu.py``.
+        task, touch, history, physics: what it was trained with, in the words of ``train_gpu.py``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -34,6 +34,7 @@ class FlatPolicy:
             saved = torch.load(path, map_location="cpu", weights_only=True)
             settings, weights = saved["settings"], saved["actor_state_dict"]
             self.task, self.touch, self.history = str(settings["task"]), str(settings["touch"]), int(settings["history"])
+            self.physics = str(settings.get("physics", "rigid"))
             inputs, outputs = weights["mlp.0.weight"].shape[1], len(weights["distribution.log_std_param"])
             hidden = [settings["hidden"]] * 2
             gaussian = {"class_name": "GaussianDistribution", "std_type": "log"}
@@ -64,7 +65,9 @@ class FlatPolicy:
     def vector(self, num_envs: int, *, hidden: Sequence[str] = (), **options: Any) -> FlatVector:
         """Environments of its task, observed as it was trained; ``options`` of ``TactileVectorEnv`` in place of those."""
         kind = getattr(raytac.envs, f"{self.task}VectorEnv")
-        return FlatVector(kind, num_envs, history=self.history, hidden=hidden, **{"tactile": self.tactile, **options})
+        return FlatVector(
+            kind, num_envs, history=self.history, hidden=hidden, **{"tactile": self.tactile, "physics": self.physics, **options}
+        )
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         with torch.inference_mode():

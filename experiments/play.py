@@ -3,6 +3,7 @@
     python experiments/play.py experiments/policies/balance_pole_wrench.pt
     python experiments/play.py runs/train_gpu/PushCube/wrench/seed0/policy.pt
     python experiments/play.py scripted --task LiftCube --episodes 20
+    python experiments/play.py experiments/policies/push_cube_markers.pt --physics ipc --episodes 4 --no-film
 
 Writes ``film.gif`` (``film.mp4`` with ``--mp4``, where the program ffmpeg is installed), ``strip.png`` and ``metrics.json``. The film
 needs MuJoCo's offscreen renderer (``MUJOCO_GL``, ``egl`` unless it is set); without, the rate is told all the same. Seeds are those of
@@ -24,6 +25,7 @@ import numpy as np
 import tyro
 
 from experiments.running import recorded, run
+from raytac.checks import check_known
 from raytac.errors import BackendError, InputError
 from raytac.io import CommonOptions, Metric
 from raytac.observe import MODALITIES, ObservationSettings
@@ -44,6 +46,8 @@ class Args(CommonOptions):
     """A file that ``train_ppo.py`` or ``train_gpu.py`` has written, or ``scripted``."""
     task: str = "LiftCube"
     """Task of the scripted policy; a file knows its own."""
+    physics: str | None = None
+    """Pads that it is played on: ``rigid`` or ``ipc``, those that it was trained on if not given. Soft ones take the CPU seconds a step."""
     episodes: int = 100
     """Episodes that are played for the success rate; 0: the film alone."""
     num_envs: int = 16
@@ -77,6 +81,10 @@ def main(args: Args) -> dict[str, Metric]:
         name, least = ("episodes", 0) if args.episodes < 0 else ("num_envs", 1)
         raise InputError(name, value=getattr(args, name), rule=f"must be {least} or more")
     OPTICS.config_class(args.optics)
+    if args.physics is not None:
+        from experiments.training import PHYSICS
+
+        check_known("physics", args.physics, PHYSICS)
     if args.mp4 and shutil.which("ffmpeg") is None:
         raise InputError("mp4", value=True, rule="needs the program ffmpeg; without --mp4 the film is a GIF")
     flat = _flat(args)
@@ -87,7 +95,8 @@ def main(args: Args) -> dict[str, Metric]:
     )
     device, files = "cpu" if args.device == "auto" else args.device, ("film.gif", "film.mp4", "strip.png")
     with recorded(args, "play", out=out, device=device, owned=files, packages=("gymnasium",)) as (folder, metrics):
-        metrics |= {"policy": args.policy, "task": task, **machine()}
+        trained = "rigid" if flat is None and recipe is None else (flat or recipe).physics  # type: ignore[union-attr]
+        metrics |= {"policy": args.policy, "task": task, "trained_on": trained, "physics": args.physics or trained, **machine()}
         if args.film:
             try:
                 film = _film(args, recipe) if flat is None else _flat_film(args, flat)
@@ -125,7 +134,7 @@ def _flat_rate(args: Args, policy: FlatPolicy) -> Evaluation:
     """Over held-out seeds, those of ``_rate``."""
     from experiments.training import HELD_OUT, Evaluation
 
-    many = policy.vector(_together(args), device=args.device)
+    many = policy.vector(_together(args), device=args.device, physics=args.physics or policy.physics)
     returns, lengths, successes, failures = [], [], 0, 0
     while len(returns) < args.episodes:
         many.reset(HELD_OUT + 2 * 10**6 + len(returns))
@@ -152,7 +161,15 @@ def _flat_film(args: Args, policy: FlatPolicy) -> Film:
     every = tuple(name for name in MODALITIES if name in (*felt, "rgb", "markers"))
     shown = ObservationSettings(every, resolution=(160, 120), optics=args.optics)
     hidden = [name for name in every if name not in felt]
-    one = policy.vector(1, hidden=hidden, tactile=shown, render_mode="rgb_array", pitch=0.4e-3, device=args.device)
+    one = policy.vector(
+        1,
+        hidden=hidden,
+        tactile=shown,
+        render_mode="rgb_array",
+        pitch=0.4e-3,
+        device=args.device,
+        physics=args.physics or policy.physics,
+    )
     one.reset(HELD_OUT + 2 * 10**6 + args.seed)
     frames, ended = [], False
     while not ended:
@@ -191,10 +208,10 @@ def _rate(args: Args, recipe: Recipe | None) -> Evaluation:
     if recipe is not None:
         from experiments.ppo_learner import Checkpoint, Learner, evaluate
 
-        learner = Learner(recipe)
+        learner = Learner(recipe, physics=args.physics or recipe.physics)
         learner.restore(Checkpoint.load(Path(args.policy)))
         return evaluate(learner, args.episodes, first_seed=2 * 10**6)
-    env, policy = KINDS[args.task](_together(args), tactile=None), SCRIPTED[args.task]
+    env, policy = KINDS[args.task](_together(args), tactile=None, physics=args.physics, device=args.device), SCRIPTED[args.task]
     returns, lengths, successes, failures = [], [], 0, 0
     while len(returns) < args.episodes:
         env.reset(seed=HELD_OUT + 2 * 10**6 + len(returns))
@@ -218,7 +235,10 @@ def _film(args: Args, recipe: Recipe | None) -> Film:
     seed = HELD_OUT + 2 * 10**6 + args.seed
     if recipe is None:
         shown = ObservationSettings(("rgb", "markers"), resolution=(160, 120), optics=args.optics)
-        env, policy = KINDS[args.task](1, tactile=shown, render_mode="rgb_array", device=args.device), SCRIPTED[args.task]
+        env, policy = (
+            KINDS[args.task](1, tactile=shown, render_mode="rgb_array", device=args.device, physics=args.physics),
+            SCRIPTED[args.task],
+        )
         env.reset(seed=seed)
         frames, ended = [], False
         while not ended:
@@ -231,12 +251,13 @@ def _film(args: Args, recipe: Recipe | None) -> Film:
     settings = tactile_settings(recipe.tactile, recipe.resolution)
     told = KINDS[recipe.task].task.tactile if settings == "task" else () if settings is None else settings.modalities  # type: ignore[union-attr]
     if "rgb" in told:
-        learner = Learner(replace(recipe, num_envs=1), render_mode="rgb_array")
+        learner = Learner(replace(recipe, num_envs=1), render_mode="rgb_array", physics=args.physics or recipe.physics)
     else:
         every = tuple(name for name in MODALITIES if name in (*told, "rgb", "markers"))
         shown = ObservationSettings(every, resolution=(160, 120), optics=args.optics)
         hidden = [name for name in every if name not in told]
-        learner = Learner(replace(recipe, num_envs=1), hidden=hidden, tactile=shown, render_mode="rgb_array", pitch=0.4e-3)
+        given = {"tactile": shown, "render_mode": "rgb_array", "pitch": 0.4e-3, "physics": args.physics or recipe.physics}
+        learner = Learner(replace(recipe, num_envs=1), hidden=hidden, **given)
     learner.restore(Checkpoint.load(Path(args.policy)))
     learner.normaliser.training = False
     seen, vectors = learner.model.get_env(), learner.base.env  # type: ignore[union-attr]

@@ -19,8 +19,8 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
-from experiments.training import HELD_OUT, KINDS, Evaluation
-from raytac.checks import check_number, check_numbers, check_seed, check_whole
+from experiments.training import HELD_OUT, KINDS, PHYSICS, Evaluation
+from raytac.checks import check_known, check_number, check_numbers, check_seed, check_whole
 from raytac.envs import ProcessVecEnv, TactileVecEnv
 from raytac.errors import InputError
 from raytac.io import write_atomic
@@ -68,6 +68,8 @@ class Recipe:
     """Environment steps at the beginning that imitate the scripted policy, which knows the state; 0 is PPO alone."""
     device: str = "cpu"
     """Of the network and of the sensors."""
+    physics: str = "rigid"
+    """Pads that it is trained on: ``rigid`` or ``ipc``."""
 
     def __post_init__(self) -> None:
         check_seed("seed", self.seed)
@@ -79,6 +81,7 @@ class Recipe:
         ranges = {"learning_rate": "(0, inf)", "gamma": "[0, 1]", "gae_lambda": "[0, 1]", "clip_range": "(0, inf)"}
         for name, interval in (ranges | {"log_std_init": "(-inf, inf)", "ent_coef": "[0, inf)"}).items():
             check_number(name, getattr(self, name), interval)
+        check_known("physics", self.physics, PHYSICS)
         for name in ("task", "tactile", "device"):
             if not isinstance(getattr(self, name), str):
                 raise InputError(name, value=getattr(self, name), rule="must be a name")
@@ -220,7 +223,7 @@ class Learner:
             raise InputError("processes", value=recipe.processes, rule=rule)
         self.recipe = recipe
         tactile = tactile_settings(recipe.tactile, recipe.resolution)
-        options: dict[str, Any] = {"tactile": tactile, "device": recipe.device, **overrides}
+        options: dict[str, Any] = {"tactile": tactile, "device": recipe.device, "physics": recipe.physics, **overrides}
         kind, count = KINDS[recipe.task], recipe.num_envs
         self.base: TactileVecEnv | ProcessVecEnv
         if recipe.processes > 1:

@@ -33,7 +33,7 @@ import numpy as np
 
 import raytac.envs
 from experiments.running import run
-from experiments.training import HELD_OUT, Evaluation, append_row, keep_rows, parse_seeds, segment_seed
+from experiments.training import HELD_OUT, PHYSICS, Evaluation, append_row, keep_rows, parse_seeds, segment_seed
 from raytac.checks import check_known, check_names, check_number, check_whole
 from raytac.errors import InputError
 from raytac.io import (
@@ -74,6 +74,8 @@ class Args(CommonOptions):
 
     task: str = "PushCube"
     """One of PushCube, BalancePole, LiftCube, RollBall, InsertPeg, OpenDrawer."""
+    physics: str = "rigid"
+    """Pads: ``rigid``, or with ``worlds="mujoco"`` ``ipc``, soft ones that ``device`` solves."""
     touch: str = "wrench"
     """What is felt, joined by commas, each trained with the same seeds: ``none``, ``task`` (as the environment has it), or modalities
     joined by ``+``, as in ``markers+wrench``. The first is that of the headline in ``metrics.json``."""
@@ -128,6 +130,7 @@ class Args(CommonOptions):
             check_whole(name, getattr(self, name))
         check_whole("processes", self.processes, 0)
         check_known("worlds", self.worlds, WORLDS)
+        check_known("physics", self.physics, PHYSICS if self.worlds == "mujoco" else ("rigid",))
         above, unit = dict.fromkeys(("learning_rate", "desired_kl", "clip", "deviation", "deviation_floor"), "(0, inf)"), "[0, 1]"
         for name, interval in {**above, "gamma": unit, "gae_lambda": unit, "entropy": "[0, inf)"}.items():
             check_number(name, getattr(self, name), interval)
@@ -160,7 +163,7 @@ class Training:
             "tactile": tactile,
         }  # fmt: skip
         if args.worlds == "mujoco":
-            self.env: RslVecEnv | RslWarpEnv = RslVecEnv(kind, processes=args.processes, **common)
+            self.env: RslVecEnv | RslWarpEnv = RslVecEnv(kind, processes=args.processes, physics=args.physics, **common)
         else:
             self.env = RslWarpEnv(kind, launches=args.launches, **common)
         # As Isaac Lab's: a reward is a rate, so that its sum over an episode is of the size of 1 to 100.
@@ -347,7 +350,7 @@ def main(args: Args) -> dict[str, Metric]:
     """Run all trainings, one after the other, and write ``metrics.json``."""
     start = time.perf_counter()
     torch.set_num_threads(args.threads)
-    out = args.folder("train_gpu", args.task)
+    out = args.folder("train_gpu", args.task if args.physics == "rigid" else f"{args.task}_{args.physics}")
     touches = parse_names(args.touch, "touch")
     seeds = parse_seeds(args.seeds)
     interrupted = False
@@ -390,6 +393,7 @@ def _checkpoint(folder: Path, settings: Mapping[str, Any], device: str) -> dict[
         kept, *_ = (saved[name] for name in ("settings", "steps", "iteration", "wall_s", "actor_state_dict"))
     except Exception as error:
         raise InputError("out", value=path, rule=f"must be a checkpoint of train_gpu ({error})") from error
+    kept = {"physics": "rigid"} | kept  # a checkpoint from before there was a choice
     if kept != settings:
         other = {k: v for k, v in kept.items() if v != settings.get(k)}
         raise InputError("out", value=folder, rule=f"holds a training of other settings, with {other}: name another folder")

@@ -24,7 +24,8 @@ from pathlib import Path
 from typing import Any
 
 from experiments.running import run
-from experiments.training import parse_seeds
+from experiments.training import PHYSICS, parse_seeds
+from raytac.checks import check_known
 from raytac.errors import InputError, RaytacError
 from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, versions, write_metrics
 from raytac.report import machine
@@ -50,6 +51,8 @@ class Args(CommonOptions):
 
     task: str = "PushCube"
     """One of PushCube, BalancePole, LiftCube, RollBall."""
+    physics: str = "rigid"
+    """Pads: ``rigid``, or ``ipc`` for soft ones, each step of which takes the CPU seconds."""
     tactile: str = "task,none"
     """What is felt, joined by commas, each trained with the same seeds: ``task`` (as the environment has it), ``none``, or
     modalities joined by ``+``, as in ``markers+wrench``."""
@@ -107,6 +110,7 @@ def main(args: Args) -> dict[str, Metric]:
     start = time.time()
     if args.task not in TASKS:
         raise InputError("task", value=args.task, rule="must be a known task", choices=TASKS)
+    check_known("physics", args.physics, PHYSICS)
     kinds = parse_names(args.tactile, "tactile")
     seeds = parse_seeds(args.seeds)
     from experiments.ppo_learner import Recipe, tactile_settings
@@ -139,7 +143,7 @@ def main(args: Args) -> dict[str, Metric]:
 
 
 def _out(args: Args) -> Path:
-    return args.out or Path("runs/train_ppo") / args.task
+    return args.out or Path("runs/train_ppo") / (args.task if args.physics == "rigid" else f"{args.task}_{args.physics}")
 
 
 def _train(job: _Job) -> None:
@@ -155,7 +159,7 @@ def _train(job: _Job) -> None:
     device = "cpu" if args.device == "auto" else args.device
     recipe = Recipe(
         args.task, job.tactile, job.seed, **{**RECIPES[args.task], **given},
-        num_envs=args.num_envs, processes=args.processes, device=device,
+        num_envs=args.num_envs, processes=args.processes, device=device, physics=args.physics,
     )  # fmt: skip
     training = Training(recipe, job.folder, evaluation=args.evaluation, say=lambda text: print(text, flush=True))
     last = 0.0

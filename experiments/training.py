@@ -17,10 +17,12 @@ from raytac.errors import InputError
 from raytac.io import parse_names, write_atomic
 from raytac.report import wilson_interval
 
-__all__ = ["HELD_OUT", "KINDS", "Evaluation", "append_row", "keep_rows", "parse_seeds", "segment_seed"]
+__all__ = ["HELD_OUT", "KINDS", "PHYSICS", "Evaluation", "append_row", "keep_rows", "parse_seeds", "segment_seed"]
 
 KINDS: Mapping[str, type[TactileVectorEnv]] = {name: getattr(raytac.envs, f"{name}VectorEnv") for name in SCRIPTED}
 """Vector of each task."""
+PHYSICS = ("rigid", "ipc")
+"""Pads that a task can be trained and played on."""
 HELD_OUT = 2**31
 """Seeds of evaluation start here; those of training are below."""
 

@@ -32,6 +32,7 @@ from ipc.meshes import (
     graded,
     grid_blocks,
     icosphere,
+    patch_blocks,
     surface_of,
     tetrahedralize,
 )
@@ -39,6 +40,7 @@ from ipc.report import ContactPairs, PairForces, PatchMotion, RigidMotion, StepR
 from ipc.settings import Settings
 
 if TYPE_CHECKING:
+    from ipc.body_arrays import BodyArrays, ContactArrays
     from ipc.state import State
     from ipc.warp_start import start_warp, use_writable_cache
     from ipc.world import World
@@ -47,6 +49,8 @@ __all__ = [
     "RAYTAC_IPC_MARKER",
     "AffineBody",
     "Body",
+    "BodyArrays",
+    "ContactArrays",
     "ContactPairs",
     "Cut",
     "HalfSpace",
@@ -75,6 +79,7 @@ __all__ = [
     "graded",
     "grid_blocks",
     "icosphere",
+    "patch_blocks",
     "rotation_matrix",
     "start_warp",
     "surface_of",
@@ -92,6 +97,10 @@ __version__ = "0.1.0"
 
 def __getattr__(name: str) -> Any:
     """Import the solver, and with it Warp, only when it is asked for."""
+    if name in ("BodyArrays", "ContactArrays"):
+        from ipc import body_arrays
+
+        return getattr(body_arrays, name)
     if name in ("World", "State"):
         from ipc import world
 

@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ipc.bodies.body import AffineBody, Body, HalfSpace, SoftBody, rotation_matrix
 from ipc.bodies.layout import build_layout
-from ipc.contact.overlap import check_overlap, find_overlap
+from ipc.body_arrays import BodyArrays, ContactArrays, WorldArrays
+from ipc.contact.overlap import OverlapCheck, find_overlap
 from ipc.errors import IpcError
 from ipc.report import ContactPairs, PairForces, PatchMotion, RigidMotion, StepReport, Wrench
 from ipc.settings import Settings
@@ -18,6 +19,7 @@ from ipc.solver.forces import bond_wrench, contact_pairs, contact_wrench, host, 
 from ipc.solver.newton import Newton
 from ipc.solver.patch_motion import RestPatches
 from ipc.solver.potential import Potential
+from ipc.solver.rest_state import RestState
 from ipc.state import State, env_mask, per_env, start_state, teleported, unit_pose
 from ipc.warp_start import LAUNCH, start_warp
 
@@ -70,8 +72,13 @@ class World:
         with LAUNCH:
             self._potential = Potential(self.layout, self.settings, num_envs, self.d_hat, self.kappa, self.device)
             self._newton = Newton(self._potential, self.layout, self.settings)
+        self._arrays = WorldArrays(self.layout, self._potential)
         self._failed = np.zeros(num_envs, bool)
         self._patches: dict[int, RestPatches] = {}
+        self._check_overlap = OverlapCheck(self.layout)
+        self._dt = np.full(num_envs, self.settings.dt)
+        self._rest: RestState | None = None
+        self._expected = np.zeros(num_envs, bool)
         frames = self.layout.frame_pose
         # Targets of the next step. They are copied to the device before a step if they changed.
         self._goal_p = np.zeros((num_envs, len(frames), 3))
@@ -124,6 +131,7 @@ class World:
     def set_gravity(self, gravity: ArrayLike) -> None:
         """Set the acceleration of every body [m/s²], world frame, shape (3,) or (B, 3)."""
         self._potential.acceleration.assign(np.ascontiguousarray(per_env(gravity, (3,), "gravity", self.num_envs)))
+        self._expected[:] = False
 
     def set_velocity(self, name: str, velocity: ArrayLike, envs: ArrayLike | None = None) -> None:
         """Set the world velocity of a soft or affine body's nodes [m/s], shape (3,) or (B, 3)."""
@@ -131,30 +139,32 @@ class World:
         v = host(self._potential.v).copy()
         v[mask, nodes] = per_env(velocity, (3,), "velocity", self.num_envs)[mask, None]
         self._potential.v.assign(v)
+        self._expected[mask] = False
 
-    def step(self, dt: float | None = None) -> StepReport:
-        """Advance every environment that has not failed by ``dt`` [s]; None: by ``settings.dt``.
+    def step(self, dt: ArrayLike | None = None, envs: ArrayLike | None = None) -> StepReport:
+        """Advance environments that have not failed by ``dt`` [s]; None: by ``settings.dt``.
 
-        On CUDA every new ``dt`` costs a recording; take few different ones.
+        Args:
+            dt: length of the step of all environments, or of each (B,); those that are not stepped may have any.
+            envs: a mask (B,) or list of the environments to step; None for all. The others stay as they are, with the forces of their
+                last step; their report says that they converged in no iteration.
 
         Raises ``IpcError`` if ``dt`` is not positive.
         """
-        if dt is not None and not 0.0 < dt < np.inf:
-            raise IpcError(f"dt = {dt}: it must be positive")
-        pot, alive = self._potential, ~self._failed
         with LAUNCH:
-            pot.set_dt(dt or self.settings.dt)
-            if self._targets_set:
-                pot.goal_p.assign(self._goal_p)
-                pot.goal_q.assign(self._goal_q)
-                self._targets_set = False
+            chosen, pot = self._prepare(dt, envs), self._potential
+            alive = ~self._failed & chosen
+            if self._rest is not None:
+                self._rest.expect(alive)
+                self._expected |= alive
             values = self._newton.step(alive)
+            self._arrays.update()
         self._failed |= values["failed"].astype(bool)
         return StepReport(
-            converged=values["converged"].astype(bool),
+            converged=values["converged"].astype(bool) | (~chosen & ~self._failed),
             failed=self._failed.copy(),
             stalled=values["stalled"].astype(bool),
-            blocked=1.0 - values["progress"],
+            blocked=np.where(chosen | self._failed, 1.0 - values["progress"], 0.0),
             min_gap=values["min_gap"],
             min_det=values["min_det"],
             newton=values["newton"].astype(np.int64),
@@ -171,10 +181,76 @@ class World:
             barrier=host(pot.barrier).copy(),
         )
 
+    def distance_from_rest(self) -> Floats:
+        """Distance of each environment from rest without contact of bonded bodies [m], (B,).
+
+        The largest distance of a node of a bonded soft body from where inertia and gravity alone would have put it in the last step; of
+        other nodes, the displacement in that step. Infinite where there was no step since the state was set, where a body has a drive or
+        damping, or a grip, and at the first call, which solves for how far bodies bend under their own mass.
+        """
+        if not self._can_rest():
+            return np.full(self.num_envs, np.inf)
+        with LAUNCH:
+            if self._rest is None:
+                self._rest = RestState(self.layout, self.settings, self._potential)
+            known = self._expected & ~self._failed
+            return np.where(known, self._rest.distance(known), np.inf)
+
+    def carry(self, dt: ArrayLike | None = None, envs: ArrayLike | None = None) -> None:
+        """Let a step pass without a solve, in environments where nothing touches a bonded body.
+
+        Driven bodies go to their targets. Bonded soft bodies go along, bent by inertia and gravity alone, and bodies that move freely stay
+        where they are. Whether that is so is for the caller to know: only for an environment with a small :meth:`distance_from_rest`, whose
+        driven bodies do not come near others, is it what :meth:`step` would do, to within that distance. Forces stay those of the last
+        step.
+
+        Args:
+            dt, envs: as of :meth:`step`.
+
+        Raises ``IpcError``: as :meth:`step`, or a world in which a body has a drive or damping, or a grip.
+        """
+        if not self._can_rest():
+            raise IpcError("bodies with a drive, damping or a grip are never at rest: use step")
+        with LAUNCH:
+            chosen = self._prepare(dt, envs) & ~self._failed
+            if self._rest is None:
+                self._rest = RestState(self.layout, self.settings, self._potential)
+            self._rest.carry(chosen)
+        self._expected |= chosen
+
+    def _can_rest(self) -> bool:
+        return not (self._potential.driven or self._potential.grips or self.layout.node_damping.any())
+
+    def _prepare(self, dt: ArrayLike | None, envs: ArrayLike | None) -> NDArray[np.bool_]:
+        """Set the length of a step and its targets; returns the mask (B,) of the environments."""
+        chosen, pot = env_mask(envs, self.num_envs), self._potential
+        lengths = per_env(self.settings.dt if dt is None else dt, (), "dt", self.num_envs)
+        if not (lengths[chosen] > 0.0).all():
+            raise IpcError(f"dt = {dt}: it must be positive")
+        if not np.array_equal(lengths, self._dt):
+            self._dt = np.array(lengths)
+            pot.dt.assign(self._dt)
+        if self._targets_set:
+            pot.goal_p.assign(self._goal_p)
+            pot.goal_q.assign(self._goal_q)
+            self._targets_set = False
+        return chosen
+
     @property
     def timers(self) -> dict[str, float]:
         """Seconds spent in ``step`` and its stages (on CUDA without ``Settings.cuda_graph``)."""
         return dict(self._newton.timers)
+
+    def arrays(self, name: str) -> BodyArrays:
+        """A body's positions, velocities and forces as arrays of the device, for DLPack; no copies."""
+        return self._arrays.body(self._index(name))
+
+    def contact_arrays(self) -> ContactArrays:
+        """All contact pairs as arrays of the device.
+
+        Ask again after a step, which may make more room.
+        """
+        return self._arrays.contacts()
 
     def frame(self, name: str) -> tuple[Floats, Floats]:
         """World rotations (B, 3, 3) and positions [m] (B, 3) of a driven body's or grip's frame."""
@@ -337,7 +413,7 @@ class World:
         ):
             if given != needed:
                 raise IpcError(f"the state has {what} of shape {given}: this world has {needed}")
-        check_overlap(self.layout, state, mask)
+        self._check_overlap(state, mask)
         quaternions = state.frame_rotation[..., [1, 2, 3, 0]]
         with LAUNCH:
             for target, values in (
@@ -354,6 +430,7 @@ class World:
                 target.assign(merged)
             self._goal_p[mask], self._goal_q[mask] = state.frame_position[mask], quaternions[mask]
             self._failed[mask] = state.failed[mask]
+            self._expected[mask] = False
             s.collision.forget(mask)
             s.collision.drop(mask)
             if s.collision.friction and s.collision.set_slips(state.stuck, state.slip, mask):
@@ -364,6 +441,7 @@ class World:
                 forces.assign(kept)
             s.set_frames(wp.zeros(self.num_envs, dtype=wp.float64, device=self.device), s.R, s.t)
             s.place_vertices(s.y, s.R, s.t, s.x)
+            self._arrays.update()
 
     def reset(self, envs: ArrayLike | None = None) -> None:
         """Put environments (a mask (B,), a list, or None for all) back to the start of the world."""

@@ -118,10 +118,9 @@ def turn_angle(rotations: np.ndarray) -> np.ndarray:
     return np.arctan2(sine, 0.5 * (np.trace(rotations, axis1=-2, axis2=-1) - 1.0))
 
 
-def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
-    """Poses (B, 4, 4) at a ``share``: linear positions, rotations along the shorter arc (slerp)."""
-    if share <= 0.0 or share >= 1.0:
-        return (start if share <= 0.0 else end).copy()
+def between(start: np.ndarray, end: np.ndarray, share: float | np.ndarray) -> np.ndarray:
+    """Poses (B, 4, 4) at a ``share``, one or (B,): linear positions, rotations by slerp."""
+    share = np.broadcast_to(np.asarray(share, float), len(start))[:, None]
     a, b = quaternions(start), quaternions(end)
     cosine = (a * b).sum(axis=1, keepdims=True)
     b = np.where(cosine < 0.0, -b, b)
@@ -132,7 +131,8 @@ def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
     result = np.tile(np.eye(4), (len(start), 1, 1))
     result[:, :3, :3] = rotation_of(q / np.linalg.norm(q, axis=1, keepdims=True))
     result[:, :3, 3] = (1.0 - share) * start[:, :3, 3] + share * end[:, :3, 3]
-    return result
+    result = np.where((share <= 0.0)[..., None], start, result)
+    return np.where((share >= 1.0)[..., None], end, result)
 
 
 def nearest_rotation(matrices: np.ndarray) -> np.ndarray:

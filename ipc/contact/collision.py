@@ -125,6 +125,7 @@ class Collision:
         rank = 2 * (framed & ~soft) + (framed & soft)
         first, second = layout.pairs.T
         values = {"framed": framed, "node_start": layout.node_start, "body": np.where(rank[first] > rank[second], first, second)}
+        values["vert_body"] = layout.vert_body
         self._turning = filled(friction.Turning, device, values)
         self._turning.turn = wp.zeros((batch, bodies), dtype=wp.mat33d, device=device)
         self._size_contacts(256, 768)
@@ -305,12 +306,13 @@ class Collision:
 
     # --- friction --------------------------------------------------------------------------------------------------------------
 
-    def measure_from(self, x: wp.array, y: wp.array, frame_q: wp.array, goal_q: wp.array) -> None:
+    def measure_from(self, x: wp.array, y: wp.array, frames: tuple[wp.array, wp.array], goals: tuple[wp.array, wp.array]) -> None:
         """Say where the start of a step is kept, and the frames' goals.
 
-        Vertices are (B, V), nodes (B, N), frames (B, frames).
+        Vertices are (B, V), nodes (B, N), rotations and positions of frames (B, frames).
         """
-        self._turning.x, self._turning.y, self._turning.frame_q, self._turning.goal_q = x, y, frame_q, goal_q
+        turning = self._turning
+        turning.x, turning.y, (turning.frame_q, turning.frame_p), (turning.goal_q, turning.goal_p) = x, y, frames, goals
 
     def lag(self, relags: wp.array, active: wp.array, changed: wp.array, sum_changed: wp.array) -> None:
         """Freeze active contacts for friction.
@@ -324,7 +326,7 @@ class Collision:
         limits, vertices = self.lagged.limit.shape, self._change.shape
         self._launch(friction.keep_lagged, limits, [self.lagged, active], [self._old])
         self._fill_index(self.memory, active)
-        inputs = [self._turning, self.contacts, self.memory, self._index, self.pair_mu, relags, active]
+        inputs = [self._turning, self.contacts, self.memory, self._index, self.pair_mu, self.d_hat, relags, active]
         self._launch(friction.lag_contacts, limits, inputs, [self.lagged])
         self._launch(friction.clear_change, vertices, [active], [self._change, self._force, changed])
         for lagged, sign in ((self.lagged, 1.0), (self._old, -1.0)):

@@ -19,6 +19,12 @@ to be averaged from the pairs and back in each step, which smooths the tractions
 slides or rolls on to other primitives, what is lost is at most a slip of ε. Pairs are found by a hash of their vertices. Where two slots
 of it collide, the lowest index wins, so nothing depends on scheduling.
 
+*Landing.* A pair that was farther apart than d̂ at the start of the step slides only from where it lands. What its frames let it slide
+before is taken off: with their relative displacement d in the step, and the gap g0 at its start, it lands after the share
+(g0 − d̂)/(−d·n) of it. Otherwise a ball that is driven down in steps of 0.1 mm would drag gel along that it has not touched yet. Where
+that share is above 1, a body without a frame, or gel that rises, has closed the gap, and all of the sliding counts; so it does on a
+plane, and where frames slide rather than land.
+
 *Frames.* z turns with one of the two bodies, the one that a frame carries if there is one, so that bodies which turn together keep their
 stress. The same turn Q moves the closest points, a gap d apart, by d (n − Qᵀ n) without any slip, which is taken off. In the step it is the
 turn that the frame is ordered to make, so that all its lags agree; what bodies without a frame turn counts at its end.
@@ -87,6 +93,7 @@ class Turning:
     Attributes:
         x, y: vertices (B, V) and nodes (B, N) at the start [m].    frame_q, goal_q: frames at the start and at the end (B, frames).
         framed: 1 where a body's frame carries it (bodies,).    node_start: first node of each body and the total.
+        frame_p, goal_p: their places [m].    vert_body: body of each vertex (V,).
         body: the body that each body pair's slips turn with (P,).    turn: Q of each body (B, bodies).
     """
 
@@ -94,8 +101,11 @@ class Turning:
     y: VecArray2d
     frame_q: QuatArray2d
     goal_q: QuatArray2d
+    frame_p: VecArray2d
+    goal_p: VecArray2d
     framed: IntArray
     node_start: IntArray
+    vert_body: IntArray
     body: IntArray
     turn: MatArray2d
 
@@ -300,6 +310,34 @@ def add_old(old: Lagged, share: FloatArray, index: Index, active: IntArray, lane
             out.limit[env, entry] = limit
 
 
+@wp.func
+def carried(turning: Turning, env: wp.int32, v: wp.int32) -> wp.vec3d:
+    """Displacement [m] of a vertex by its body's frame in the whole step; 0 without one."""
+    x, body = turning.x[env, v] + wp.vec3d(), turning.vert_body[v] + 0
+    if turning.framed[body] == 0:
+        return wp.vec3d()
+    local = wp.quat_rotate_inv(turning.frame_q[env, body], x - turning.frame_p[env, body])
+    return wp.quat_rotate(turning.goal_q[env, body], local) + turning.goal_p[env, body] - x
+
+
+@wp.func
+def slid_before_contact(
+    turning: Turning, env: wp.int32, verts: wp.vec4i, c: wp.vec4d, n: wp.vec3d, turn: wp.mat33d, d_hat: wp.float64
+) -> wp.vec3d:
+    """Sliding [m] of a new pair, as its frames move, before it comes within d̂ in a step."""
+    if verts[1] < 0:  # a plane
+        return wp.vec3d()
+    gap, d, n_start = wp.float64(0.0), wp.vec3d(), wp.transpose(turn) * n
+    for i in range(4):
+        gap += c[i] * wp.dot(turning.x[env, verts[i]], n_start)
+        d += c[i] * carried(turning, env, verts[i])
+    approach = -wp.dot(d, n)
+    # What slides, within 1 % of flat, comes near by the tilt of its facets alone.
+    if gap <= d_hat or approach <= gap - d_hat or approach <= wp.float64(0.01) * wp.length(d):
+        return wp.vec3d()
+    return ((gap - d_hat) / approach) * (d - wp.dot(d, n) * n)
+
+
 @wp.kernel
 def lag_contacts(
     turning: Turning,
@@ -307,6 +345,7 @@ def lag_contacts(
     memory: Memory,
     index: Index,
     mu: FloatArray,
+    d_hat: wp.float64,
     relags: IntArray,
     active: IntArray,
     # outputs
@@ -332,6 +371,8 @@ def lag_contacts(
         entry = find_pair(index, memory.verts, memory.pair, env, verts, pair)
         if entry >= 0:
             slip += in_tangent_plane(turn * memory.slip[env, entry], n)
+        else:
+            slip -= slid_before_contact(turning, env, verts, coef, n, turn, d_hat)
         out.verts[env, i] = verts
         out.coef[env, i] = coef
         out.normal[env, i] = n

@@ -7,6 +7,9 @@ are computed in integers of any length. Nothing depends on how thin a triangle o
 
 from __future__ import annotations
 
+from hashlib import blake2b
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +29,8 @@ _UNDERFLOW = 1e-280
 """Terms below this may have lost digits to underflow."""
 _CHUNK = 64
 """Boxes that are compared with others at once."""
+_KNOWN = 2**14
+"""Most pairs that are remembered to be apart."""
 
 
 def _whole(x: Floats) -> NDArray[np.object_]:
@@ -184,44 +189,79 @@ def find_overlap(layout: Layout, x: Floats, normal: Floats, origin: Floats) -> s
         normal, origin: of the half-spaces among the bodies, world frame, (bodies, 3) and [m] (bodies, 3).
     """
     for a, b in layout.pairs:
-        na, nb = layout.names[a], layout.names[b]
-        va = slice(layout.vert_start[a], layout.vert_start[a + 1])
-        if layout.half_space[b]:
-            height = (x[va] - origin[b]) @ normal[b]
-            low = int(np.argmin(height))
-            if height[low] <= 0:
-                where = f"lies {-height[low]:.3g} m inside" if height[low] < 0 else "touches"
-                return f"vertex {low} of {na!r} {where} the half-space {nb!r}"
-            continue
-        for first, second in ((a, b), (b, a)) if a != b else ((a, b),):
-            edges = layout.edges[layout.edge_start[first] : layout.edge_start[first + 1]]
-            faces = layout.faces[layout.face_start[second] : layout.face_start[second + 1]]
-            hit = _edge_face_hits(x, edges, faces)
-            if hit is not None:
-                e, f = edges[hit[0]] - layout.vert_start[first], hit[1]
-                meets = "touches" if hit[2] is None else f"goes {hit[2]:.3g} m through"
-                return (
-                    f"edge {hit[0]} (vertices {e[0]}, {e[1]}) of {layout.names[first]!r} {meets} triangle {f} of "
-                    f"{layout.names[second]!r}"
-                )
-        if a != b:
-            for inner, outer in ((a, b), (b, a)):
-                faces = layout.faces[layout.face_start[outer] : layout.face_start[outer + 1]]
-                if _is_closed(faces) and _contains(x, faces, x[layout.vert_start[inner]]):
-                    return f"{layout.names[inner]!r} lies inside {layout.names[outer]!r}"
+        overlap = _find_pair_overlap(layout, int(a), int(b), x, normal, origin)
+        if overlap is not None:
+            return overlap
     return None
 
 
-def check_overlap(layout: Layout, state: State, mask: NDArray[np.bool_]) -> None:
-    """Refuse surfaces that cross in the mask's environments (equal ones once): OverlapError."""
-    seen: set[bytes] = set()
-    for env in np.flatnonzero(mask):
-        key = state.y[env].tobytes() + state.frame_rotation[env].tobytes() + state.frame_position[env].tobytes()
-        if key in seen or state.failed[env] or not np.isfinite(state.y[env]).all():
-            continue
-        seen.add(key)
-        rotation, position = state.frame_rotation[env], state.frame_position[env]
-        x = world_vertices(layout, state.y[env], rotation, position)
-        overlap = find_overlap(layout, x, rotation_matrix(rotation)[:, :, 2], position)
-        if overlap is not None:
-            raise OverlapError(f"environment {env}: {overlap}: start with the surfaces apart")
+def _find_pair_overlap(layout: Layout, a: int, b: int, x: Floats, normal: Floats, origin: Floats) -> str | None:
+    """The first overlap of two bodies, or of one with itself; arguments as of ``find_overlap``."""
+    na, nb = layout.names[a], layout.names[b]
+    va = slice(layout.vert_start[a], layout.vert_start[a + 1])
+    if layout.half_space[b]:
+        height = (x[va] - origin[b]) @ normal[b]
+        low = int(np.argmin(height))
+        if height[low] <= 0:
+            where = f"lies {-height[low]:.3g} m inside" if height[low] < 0 else "touches"
+            return f"vertex {low} of {na!r} {where} the half-space {nb!r}"
+        return None
+    for first, second in ((a, b), (b, a)) if a != b else ((a, b),):
+        edges = layout.edges[layout.edge_start[first] : layout.edge_start[first + 1]]
+        faces = layout.faces[layout.face_start[second] : layout.face_start[second + 1]]
+        hit = _edge_face_hits(x, edges, faces)
+        if hit is not None:
+            e, f = edges[hit[0]] - layout.vert_start[first], hit[1]
+            meets = "touches" if hit[2] is None else f"goes {hit[2]:.3g} m through"
+            return (
+                f"edge {hit[0]} (vertices {e[0]}, {e[1]}) of {layout.names[first]!r} {meets} triangle {f} of "
+                f"{layout.names[second]!r}"
+            )
+    if a != b:
+        for inner, outer in ((a, b), (b, a)):
+            faces = layout.faces[layout.face_start[outer] : layout.face_start[outer + 1]]
+            if _is_closed(faces) and _contains(x, faces, x[layout.vert_start[inner]]):
+                return f"{layout.names[inner]!r} lies inside {layout.names[outer]!r}"
+    return None
+
+
+class OverlapCheck:
+    """Refusal of states in which surfaces cross; pairs that were once apart are not tested again.
+
+    A body alone is known by the shape of its own surface, wherever its frame is; two bodies by their shapes and frames.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        self._clear: dict[bytes, None] = {}
+        """Digests of pairs that are apart, the latest last."""
+
+    def __call__(self, state: State, mask: NDArray[np.bool_]) -> None:
+        """Refuse surfaces that cross in the mask's environments: OverlapError."""
+        layout = self._layout
+        for env in np.flatnonzero(mask):
+            if state.failed[env] or not np.isfinite(state.y[env]).all():
+                continue
+            y, rotation, position = state.y[env], state.frame_rotation[env], state.frame_position[env]
+            unknown = [(key, a, b) for key, a, b in self._keys(y, rotation, position) if key not in self._clear]
+            if not unknown:
+                continue
+            x, normal = world_vertices(layout, y, rotation, position), rotation_matrix(rotation)[:, :, 2]
+            for key, a, b in unknown:
+                overlap = _find_pair_overlap(layout, a, b, x, normal, position)
+                if overlap is not None:
+                    raise OverlapError(f"environment {env}: {overlap}: start with the surfaces apart")
+                self._clear[key] = None
+        while len(self._clear) > _KNOWN:
+            del self._clear[next(iter(self._clear))]
+
+    def _keys(self, y: Floats, rotation: Floats, position: Floats) -> list[tuple[bytes, int, int]]:
+        """Digest of every pair of bodies that may touch, and their numbers."""
+        layout = self._layout
+        shapes = [y[first:last].tobytes() for first, last in pairwise(layout.node_start)]
+        frames = [rotation[k].tobytes() + position[k].tobytes() for k in range(len(layout.names))]
+        keys = []
+        for index, (a, b) in enumerate(layout.pairs.tolist()):
+            parts = [shapes[a]] if a == b else [shapes[a], frames[a], shapes[b], frames[b]]
+            keys.append((blake2b(b"".join([str(index).encode(), *parts]), digest_size=16).digest(), a, b))
+        return keys

@@ -14,6 +14,7 @@ from ipc.meshes.mesh import (
     surface_topology,
     tet_volumes,
 )
+from ipc.meshes.patches import patch_blocks
 from ipc.meshes.tetwild import tetrahedralize
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "graded",
     "grid_blocks",
     "icosphere",
+    "patch_blocks",
     "surface_of",
     "surface_topology",
     "tet_volumes",

@@ -138,7 +138,7 @@ def after_solve(iterations: IntArray, negative: IntArray, mask: IntArray, d: Dec
 
 
 @wp.kernel
-def judge_direction(dt: wp.float64, d: Decisions, f: Flags):
+def judge_direction(dt: FloatArray, d: Decisions, f: Flags):
     """Drops environments that are not finite; others advance frames or take a plain step."""
     env = wp.tid()
     d.plain[env] = 0
@@ -152,7 +152,7 @@ def judge_direction(dt: wp.float64, d: Decisions, f: Flags):
         d.active[env] = 0
         d.advancing[env] = 0
         return
-    d.speed[env] = d.size[env] / dt
+    d.speed[env] = d.size[env] / dt[env]
     if d.advancing[env] == 0:
         d.plain[env] = 1
         f.plain[0] = 1

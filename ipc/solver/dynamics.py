@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Masses:
-    """Mass matrix [kg] in the block pattern, ``inertia`` with drives [kg], ``drag`` [kg/s²]."""
+    """Mass matrix [kg] in the block pattern, ``inertia`` with drives [kg], ``drag`` [kg/s]."""
 
     row_start: IntArray
     col: IntArray
@@ -31,9 +31,10 @@ class Masses:
 
 
 @wp.kernel
-def predict(xw: VecArray2d, v: VecArray2d, acceleration: VecArray, h: wp.float64, target: VecArray2d):
+def predict(xw: VecArray2d, v: VecArray2d, acceleration: VecArray, dt: FloatArray, target: VecArray2d):
     """x̃ of the nodes, world frame."""
     env, i = wp.tid()
+    h = dt[env] + wp.float64(0.0)
     target[env, i] = xw[env, i] + h * v[env, i] + h * h * acceleration[env]
 
 
@@ -61,7 +62,7 @@ def node_gradient(
     local_target: VecArray2d,
     local_start: VecArray2d,
     masses: Masses,
-    inertia_scale: wp.float64,
+    dt: FloatArray,
     vert_gradient: VecArray2d,
     R: MatArray2d,
     node_body: IntArray,
@@ -81,13 +82,15 @@ def node_gradient(
     env, i = wp.tid()
     if active[env] == 0:
         return
+    h = dt[env] + wp.float64(0.0)
+    inertia_scale = wp.float64(1.0) / (h * h)
     g = gradient[env, i]
     elastic = wp.length(g)
     for k in range(masses.row_start[i], masses.row_start[i + 1]):
         j = masses.col[k]
         if masses.inertia[k] != wp.float64(0.0):
             pull = (masses.inertia[k] * inertia_scale) * (y[env, j] - local_target[env, j])
-            g += pull + masses.drag[k] * (y[env, j] - local_start[env, j])
+            g += pull + (masses.drag[k] / h) * (y[env, j] - local_start[env, j])
     contact = wp.vec3d()
     for k in range(verts.follower_start[i], verts.follower_start[i + 1]):
         contact += verts.follower_weight[k] * vert_gradient[env, verts.follower[k]]
@@ -107,7 +110,7 @@ def inertia_change(
     local_target: VecArray2d,
     local_start: VecArray2d,
     masses: Masses,
-    inertia_scale: wp.float64,
+    dt: FloatArray,
     active: IntArray,
     # outputs
     change: FloatArray2d,
@@ -117,22 +120,24 @@ def inertia_change(
     if active[env] == 0:
         return
     half = wp.float64(0.5)
+    h = dt[env] + wp.float64(0.0)
+    inertia_scale = wp.float64(1.0) / (h * h)
     f = wp.vec3d()
     for k in range(masses.row_start[i], masses.row_start[i + 1]):
         j = masses.col[k]
         if masses.inertia[k] != wp.float64(0.0):
             mean = half * (y0[env, j] + y1[env, j])
             pull = (masses.inertia[k] * inertia_scale) * (mean - local_target[env, j])
-            f += pull + masses.drag[k] * (mean - local_start[env, j])
+            f += pull + (masses.drag[k] / h) * (mean - local_start[env, j])
     change[env, i] = wp.dot(y1[env, i] - y0[env, i], f)
 
 
 @wp.kernel
-def new_velocity(xw_new: VecArray2d, xw: VecArray2d, h: wp.float64, active: IntArray, v: VecArray2d):
+def new_velocity(xw_new: VecArray2d, xw: VecArray2d, dt: FloatArray, active: IntArray, v: VecArray2d):
     """Velocities at the end of the step, world frame."""
     env, i = wp.tid()
     if active[env] != 0:
-        v[env, i] = (xw_new[env, i] - xw[env, i]) / h
+        v[env, i] = (xw_new[env, i] - xw[env, i]) / dt[env]
 
 
 @wp.kernel

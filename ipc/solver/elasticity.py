@@ -281,7 +281,7 @@ def block_hessian(
     part: IntArray,
     elements: Elements,
     masses: Masses,
-    inertia_scale: wp.float64,
+    dt: FloatArray,
     el_F: MatArray2d,
     el_mckl: Vec4Array2d,
     active: IntArray,
@@ -297,7 +297,8 @@ def block_hessian(
         return
     k = upper[u, 0]
     one = wp.identity(n=3, dtype=wp.float64)
-    H = (masses.inertia[k] * inertia_scale + masses.drag[k]) * one
+    h = dt[env] + wp.float64(0.0)
+    H = (masses.inertia[k] * (wp.float64(1.0) / (h * h)) + masses.drag[k] / h) * one
     for s in range(part_start[k], part_start[k + 1]):
         e = part[s] / 16
         code = part[s] - 16 * e

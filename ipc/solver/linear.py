@@ -2,7 +2,7 @@
 
 It is a block matrix of one pattern, with rows of volume blocks and of contacts.
 
-Products with it, its diagonal, and approximations of its inverse. Everything here can be recorded in a CUDA graph: launches have fixed
+Products with it, and what approximates its inverse. Everything here can be recorded in a CUDA graph: launches have fixed
 dimensions, counts are read on the device.
 """
 
@@ -215,63 +215,6 @@ def push_blocks(system: SystemView, lift: VecArray2d, active: IntArray, residual
         residual[env, i] = residual[env, i] - block_row(system, env, i, lift)
 
 
-@wp.kernel
-def diagonal_blocks(system: SystemView, active: IntArray, out: MatArray2d):
-    """Diagonal blocks of the matrix without contacts."""
-    env, i = wp.tid()
-    if active[env] == 0:
-        return
-    D = system.blocks[env, system.diagonal[i]]
-    for m in range(system.node_pair_start[i], system.node_pair_start[i + 1]):
-        q = system.volume_row[env, system.node_pair[m]]
-        D += wp.outer(q, q)
-    out[env, i] = D
-
-
-@wp.kernel
-def diagonal_rows(system: SystemView, contacts: Contacts, active: IntArray, lanes: wp.int32, out: MatArray2d):
-    """Adds the diagonal blocks of Σ q qᵀ."""
-    env, lane = wp.tid()
-    if active[env] == 0:
-        return
-    for r in range(lane, rows_of(contacts, env), lanes):
-        verts, row = contacts.row_verts[env, r], contacts.row[env, r]
-        for k in range(4):
-            v = verts[k]
-            if v >= 0:
-                q = wp.transpose(system.R[env, system.verts.body[v]]) * row_column(row, k)
-                for m in range(system.verts.count[v]):
-                    w = system.verts.weight[v, m]
-                    wp.atomic_add(out, env, system.verts.nodes[v, m], (w * w) * wp.outer(q, q))
-
-
-@wp.kernel
-def invert_blocks(free: IntArray, active: IntArray, blocks: MatArray2d):
-    """Inverts in place; one that is not positive becomes the inverse of its mean diagonal."""
-    env, i = wp.tid()
-    if active[env] == 0:
-        return
-    A = blocks[env, i]
-    minor = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
-    det = wp.determinant(A)
-    size = wp.trace(A) / wp.float64(3.0)
-    zero = wp.float64(0.0)
-    if free[i] == 0:
-        blocks[env, i] = wp.mat33d()
-    elif A[0, 0] > zero and minor > zero and det > wp.float64(1.0e-12) * size * size * size:
-        B = wp.inverse(A)
-        blocks[env, i] = wp.float64(0.5) * (B + wp.transpose(B))
-    else:
-        blocks[env, i] = (wp.float64(1.0) / wp.max(wp.abs(size), wp.float64(1.0e-30))) * wp.identity(n=3, dtype=wp.float64)
-
-
-@wp.kernel
-def apply_blocks(inverse: MatArray2d, r: VecArray2d, running: IntArray, z: VecArray2d):
-    env, i = wp.tid()
-    if running[env] != 0:
-        z[env, i] = inverse[env, i] * r[env, i]
-
-
 class Preconditioner(Protocol):
     """Approximates H⁻¹, symmetric and positive definite."""
 
@@ -282,22 +225,3 @@ class Preconditioner(Protocol):
     def apply(self, r: wp.array, running: wp.array, z: wp.array) -> None:
         """z = M⁻¹ r for the running environments; arrays (B, N) of vec3d."""
         ...
-
-
-class BlockJacobi:
-    """Inverses of the 3×3 diagonal blocks with contact rows, shared by ``lanes`` threads."""
-
-    def __init__(self, batch: int, nodes: int, lanes: int, device: wp.Device) -> None:
-        self.lanes = lanes
-        self.inverse = wp.zeros((batch, nodes), dtype=wp.mat33d, device=device)
-
-    def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
-        device, dim = self.inverse.device, self.inverse.shape
-        wp.launch(diagonal_blocks, dim=dim, inputs=[system, active], outputs=[self.inverse], device=device)
-        if rows:
-            inputs = [system, contacts, active, self.lanes]
-            wp.launch(diagonal_rows, dim=(dim[0], self.lanes), inputs=inputs, outputs=[self.inverse], device=device)
-        wp.launch(invert_blocks, dim=dim, inputs=[system.free, active], outputs=[self.inverse], device=device)
-
-    def apply(self, r: wp.array, running: wp.array, z: wp.array) -> None:
-        wp.launch(apply_blocks, dim=r.shape, inputs=[self.inverse, r, running], outputs=[z], device=r.device)

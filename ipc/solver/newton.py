@@ -50,7 +50,7 @@ class Newton:
         self.preconditioner = make_preconditioner(layout, settings, self.batch, lanes, self.device)
         self._still = wp.zeros_like(potential.x)
         self._friction = int(potential.collision.friction)
-        self._graphs: dict[tuple[str, float], Any] = {}
+        self._graphs: dict[str, Any] = {}
         self._recording = False
         self.timers: dict[str, float] = {}
 
@@ -73,7 +73,7 @@ class Newton:
         if not (self.device.is_cuda and self.settings.cuda_graph):
             body()
             return
-        key = body.__name__, self.potential.dt  # a recording holds the length of its step
+        key = body.__name__
         if key not in self._graphs:
             wp.load_module("ipc", device=self.device, recursive=True)
             self._recording = True

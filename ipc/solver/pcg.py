@@ -17,8 +17,10 @@ import warp as wp
 from ipc.arrays import FloatArray2d, IntArray, VecArray2d
 from ipc.contact.contacts import Contacts
 from ipc.reduce import BLOCK, chunks_of, raise_if_any, total_of
-from ipc.solver.linear import BlockJacobi, Preconditioner, SystemView, find_volume_motions, multiply_blocks, multiply_rows
-from ipc.solver.pcg_block import THREADS, Scalars, solve_in_one_block
+from ipc.solver.block_jacobi import BlockJacobi
+from ipc.solver.blocks import THREADS
+from ipc.solver.linear import Preconditioner, SystemView, find_volume_motions, multiply_blocks, multiply_rows
+from ipc.solver.pcg_block import Scalars, solve_in_one_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -173,7 +175,8 @@ class Pcg:
         if isinstance(preconditioner, BlockJacobi) and self.one_block:
             threads = THREADS if self.device.is_cuda else 1
             inputs = [
-                *(system, contacts, preconditioner.inverse, tolerance, max_iterations, threads, min(self.lanes, threads), active),
+                *(system, contacts, preconditioner.inverse, preconditioner.elimination, tolerance, max_iterations),
+                *(threads, min(self.lanes, threads), active),
                 *(self._p, self._Ap),
             ]
             size, outputs = (self.batch, threads), [residual, x, self.scalars]

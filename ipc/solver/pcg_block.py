@@ -14,12 +14,11 @@ import warp as wp
 
 from ipc.arrays import FloatArray, FloatArray2d, IntArray, MatArray2d, VecArray2d
 from ipc.contact.contacts import Contacts, rows_of
+from ipc.solver.affine_elimination import Elimination, finish_elimination
+from ipc.solver.blocks import block_sum, wait_for_block
 from ipc.solver.linear import SystemView, add_row, block_row, find_volume_motion
 
 wp.set_module_options({"enable_backward": False})
-
-THREADS = 256
-"""Threads of a block on CUDA; twice as many would not fit, for the registers they need."""
 
 
 @wp.struct
@@ -32,20 +31,13 @@ class Scalars:
     negative: IntArray
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-#endif
-""")
-def wait_for_block():
-    """Every thread's writes are there for the whole block after this; on a CPU a block is one."""
-    ...
-
-
 @wp.func
-def block_sum(value: wp.float64) -> wp.float64:
-    """Sum over the threads of the block, in a fixed order; every thread gets it."""
-    return wp.tile_extract(wp.tile_sum(wp.tile(value)), 0)
+def dot_share(env: wp.int32, lane: wp.int32, threads: wp.int32, r: VecArray2d, z: VecArray2d) -> wp.float64:
+    """A thread's share of r·z."""
+    total = wp.float64(0.0)
+    for i in range(lane, r.shape[1], threads):
+        total += wp.dot(r[env, i], z[env, i])
+    return total
 
 
 @wp.kernel
@@ -53,6 +45,7 @@ def solve_in_one_block(
     system: SystemView,
     contacts: Contacts,
     inverse: MatArray2d,
+    affine: Elimination,
     tolerance: wp.float64,
     max_iterations: wp.int32,
     threads: wp.int32,
@@ -70,6 +63,7 @@ def solve_in_one_block(
     if active[env] == 0:
         return
     n = r.shape[1]
+    affines = affine.node.shape[0]
     volumes = system.volume_motion.shape[1]
     rows = rows_of(contacts, env)
     a = wp.float64(0.0)
@@ -81,6 +75,10 @@ def solve_in_one_block(
         a += wp.length_sq(r[env, i])
         b += wp.dot(r[env, i], z)
         i += threads
+    if affines > 0:
+        wait_for_block()
+        finish_elimination(affine, inverse, env, lane, threads, r, p)
+        b = dot_share(env, lane, threads, r, p)
     rr0 = block_sum(a)
     rz = block_sum(b)
     if lane == 0:
@@ -132,6 +130,10 @@ def solve_in_one_block(
             a += wp.length_sq(r_new)
             b += wp.dot(r_new, z)
             i += threads
+        if affines > 0:
+            wait_for_block()
+            finish_elimination(affine, inverse, env, lane, threads, r, Ap)
+            b = dot_share(env, lane, threads, r, Ap)
         rr = block_sum(a)
         rz_new = block_sum(b)
         if not (rr > tolerance * tolerance * rr0):

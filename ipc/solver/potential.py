@@ -61,12 +61,12 @@ class Potential:
         self.node_body, self.node_free = ints(layout.node_body), ints(layout.node_free)
         rows = np.repeat(np.arange(nodes, dtype=np.int64), np.diff(layout.row_start))
         diagonal = np.flatnonzero(rows == layout.col).astype(np.int32)
-        self.dt = settings.dt
-        self._damping = np.zeros(len(layout.col))
-        self._damping[diagonal] = layout.node_damping
+        self.dt = wp.full(batch, settings.dt, dtype=wp.float64, device=device)
+        drag = np.zeros(len(layout.col))
+        drag[diagonal] = layout.node_damping
         pattern = {"row_start": layout.row_start, "col": layout.col, "mass": layout.mass}
         inertia = layout.mass * (1.0 + layout.node_drive[rows])
-        self.masses = filled(dynamics.Masses, device, {**pattern, "inertia": inertia, "drag": self._damping / self.dt})
+        self.masses = filled(dynamics.Masses, device, {**pattern, "inertia": inertia, "drag": drag})
         self.drive = [floats(layout.node_drive), ints(layout.node_aim), wp.array(layout.aim_local, dtype=wp.vec3d, device=device)]
         self.driven = bool((layout.node_aim >= 0).any())
         self.grips = len(layout.grip_node)
@@ -102,7 +102,7 @@ class Potential:
         self.dilation = numbers(batch, blocks)
         self.node_change, self.force_size, self.vert_size = numbers(batch, nodes), numbers(batch, nodes), numbers(batch, verts)
         self.reach, self.barrier, self.elastic_energy, self.kinetic = (numbers() for _ in range(4))
-        self.collision.measure_from(self.x_start, self.y_start, self.frame_q, self.goal_q)
+        self.collision.measure_from(self.x_start, self.y_start, (self.frame_q, self.frame_p), (self.goal_q, self.goal_p))
         self.project = wp.zeros(batch, dtype=wp.int32, device=device)
         self.everyone = wp.full(batch, 1, dtype=wp.int32, device=device)
 
@@ -128,20 +128,9 @@ class Potential:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs or [], device=self.device)
 
     @property
-    def inertia_scale(self) -> float:
-        """1/h² [1/s²]."""
-        return 1.0 / (self.dt * self.dt)
-
-    @property
     def friction_eps(self) -> float:
         """ε [m]."""
         return self.settings.friction_slip
-
-    def set_dt(self, dt: float) -> None:
-        """Let the next steps be ``dt`` [s] long."""
-        if dt != self.dt:
-            self.dt = dt
-            self.masses.drag.assign(self._damping / dt)
 
     # --- places ----------------------------------------------------------------------------------------------------------------
 
@@ -220,7 +209,7 @@ class Potential:
         self.launch(elasticity.node_elastic_gradient, self.y.shape, inputs, [self.gradient])
         self.touch(active)
         inputs = [
-            *(self.y, self.local_target, self.local_start, self.masses, self.inertia_scale, self.vert_gradient),
+            *(self.y, self.local_target, self.local_start, self.masses, self.dt, self.vert_gradient),
             *(self.R, self.node_body, self.node_free, self.verts, active),
         ]
         self.launch(dynamics.node_gradient, self.y.shape, inputs, [self.gradient, self.residual, self.force_size])
@@ -228,7 +217,7 @@ class Potential:
     def fill_matrix(self, active: wp.array) -> None:
         """Inertia and elasticity, from results of :meth:`evaluate_elements`."""
         inputs = [
-            *(self.upper, self.part_start, self.part, self.elements, self.masses, self.inertia_scale),
+            *(self.upper, self.part_start, self.part, self.elements, self.masses, self.dt),
             *(self.el_F, self.el_mckl, active),
         ]
         self.launch(elasticity.block_hessian, (self.batch, len(self.upper)), inputs, [self.system.blocks])
@@ -255,7 +244,7 @@ class Potential:
         change.zero_()
         self.elastic_change(active, min_det)
         self.reduce(self.el_change, active, SUM, change)
-        inputs = [self.y, self.y1, self.local_target, self.local_start, self.masses, self.inertia_scale, active]
+        inputs = [self.y, self.y1, self.local_target, self.local_start, self.masses, self.dt, active]
         self.launch(dynamics.inertia_change, self.y.shape, inputs, [self.node_change])
         self.reduce(self.node_change, active, SUM, change)
         self.collision.energy_change(

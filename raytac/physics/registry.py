@@ -29,6 +29,15 @@ def checked_physics(physics: str | PhysicsConfig | None) -> PhysicsConfig | None
     return config
 
 
+def rigid_physics(physics: str | PhysicsConfig | None) -> PhysicsConfig | None:
+    """As ``checked_physics``; ``InputError`` for soft pads, in a loop that does not step a solver."""
+    config = checked_physics(physics)
+    if config is not None and config.is_simulated:
+        rule = "must be rigid where somebody else steps MuJoCo: soft pads are stepped with the world, by TactileWorld with a task scene"
+        raise InputError("physics", value=physics, rule=rule, choices=("rigid",))
+    return config
+
+
 class _Scene(Protocol):
     """Physics named by a press, a task or a sweep."""
 

@@ -12,6 +12,7 @@ from raytac.checks import MOST_ENVIRONMENTS, check_whole
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.gel.surface import chosen_envs
+from raytac.physics.registry import rigid_physics
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.rigid_pads import pads_on_c_mujoco
 from raytac.world.sensor_frames import SensorFrames
@@ -19,6 +20,7 @@ from raytac.world.world_model import checked_states, own_world_model
 from raytac.world.world_state import check_controls
 
 if TYPE_CHECKING:
+    from raytac.physics.base import PhysicsConfig
     from raytac.robots.mount import SensorChoice
     from raytac.sensor import SensorSettings
     from raytac.world.touched import TouchChoice
@@ -59,6 +61,7 @@ class PadStepper:
         num_envs: int = 1,
         allow_overlap: Sequence[str] = (),
         keyframe: str | None = None,
+        physics: str | PhysicsConfig | None = None,
         seed: int = 0,
         **settings: Unpack[SensorSettings],
     ) -> None:
@@ -68,19 +71,21 @@ class PadStepper:
             model: model with sensors that ``raytac.mount`` put on it.
             sensors, touches, allow_overlap, keyframe: as of ``TactileWorld``.
             num_envs: number of states B that are stepped together.
+            physics: name or configuration of rigid pads; None is ``rigid``.
             seed: of every random number.
             settings: ``outputs``, ``markers``, ``optics``, ``resolution``, ``device`` and ``pitch`` of every sensor.
 
         Raises:
-            InputError: what ``TactileWorld`` refuses of a given model.
+            InputError: what ``TactileWorld`` refuses of a given model, or soft pads.
         """
+        config = rigid_physics(physics)
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
         self.model = model
         self.composed = own_world_model(
             model, sensors=sensors, touches=touches, keyframe=keyframe, allow_overlap=allow_overlap, own_contact=True
         )
         self.failed = np.zeros(num_envs, bool)
-        self._frames = SensorFrames(self.composed.sensors, num_envs=num_envs, seed=seed, **settings)
+        self._frames = SensorFrames(self.composed.sensors, num_envs=num_envs, seed=seed, physics=config, **settings)
         self._models = EnvironmentModels(self.composed, num_envs)
         self._pads, self._engine = pads_on_c_mujoco(self.composed, self._models, [mujoco.MjData(model)] * num_envs)
         self._time = np.full(num_envs, -np.inf)
@@ -145,15 +150,20 @@ class PadStepper:
         return np.where(self.failed[:, None], np.nan, self._pads.wrench(name))
 
     def observe(
-        self, data: mujoco.MjData | Sequence[mujoco.MjData], sensors: Sequence[str] | str | None = None
+        self,
+        data: mujoco.MjData | Sequence[mujoco.MjData],
+        sensors: Sequence[str] | str | None = None,
+        envs: np.ndarray | list[int] | None = None,
     ) -> dict[str, TactileFrame]:
         """Frames of the sensor or sensors named (all if None) at the present poses.
 
-        Raises ``InputError``: another number of states or an unknown sensor; as ``TactileSensor.update``.
+        ``envs`` (a mask (B,) or a list): as of ``TactileWorld.observe``; all states are given.
+
+        Raises ``InputError``: another number of states, an unknown sensor or state; as ``TactileSensor.update``.
         """
         self._engine.bind(checked_states(self.model, self.model, data, len(self.failed)))
         return self._frames.observe(
-            lambda name, grid, rows: self._pads.reading(name, grid, self.failed, rows), self.failed, sensors, None
+            lambda name, grid, rows: self._pads.reading(name, grid, self.failed, rows), self.failed, sensors, envs
         )
 
     def _states(self, model: mujoco.MjModel, data: mujoco.MjData | Sequence[mujoco.MjData]) -> list[mujoco.MjData]:

@@ -14,16 +14,17 @@ from itertools import combinations
 
 import mujoco
 import numpy as np
+import warp as wp
 
 import ipc
 from raytac.device import resolve_device
 from raytac.errors import InputError, OverlapError, SpecError
 from raytac.gel.surface import GelSurface, PadGrid
-from raytac.gel.traction import CoatTraction
 from raytac.physics.base import PadReading
 from raytac.physics.configs import Ipc
 from raytac.physics.objects import object_parts
 from raytac.physics.soft.bodies import SceneBody, ScenePad, scene_body
+from raytac.physics.soft.coat_points import CoatMarkers, CoatTraction
 from raytac.physics.soft.mesh import pad_mesh
 from raytac.physics.soft.scene import SoftScene
 from raytac.physics.soft.scene_state import SceneReport
@@ -36,6 +37,7 @@ from raytac.specs.task import PAIR_FRICTION, TaskScene
 from raytac.world.coupling import Coupling, coupling_inputs
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.forbidden_overlap import Inside, RobotOverlap
+from raytac.world.warp_frame import WarpFrame
 from raytac.world.world_model import WorldModel
 from raytac.world.world_state import Drive, lost
 
@@ -47,7 +49,10 @@ _CELLS = 8
 _INSIDE = 1e-4
 """Most overlap of a body with a case or link that is not reported [m]: rounding."""
 
-_REPORT = {"min_gap": np.inf, "min_det": 1.0, "blocked": 0.0, "converged": True, "unconverged": 0, "newton": 0, "substeps": 0}
+_REPORT = {
+    **{"min_gap": np.inf, "min_det": 1.0, "blocked": 0.0, "converged": True},
+    **{"unconverged": 0, "newton": 0, "linear": 0, "substeps": 0},
+}
 """Fields of ``SceneReport`` that a world reports, and their values before any step."""
 
 
@@ -111,6 +116,7 @@ class SoftPads:
         self._last_cases = self._pad_poses(datas)
         self._last_driven = {b.name: np.stack([starts[b.name]] * len(datas)) for b in self._driven}
         self._traction: dict[str, CoatTraction] = {}
+        self._markers: dict[str, CoatMarkers] = {}
         self._wrench = {m.name: np.zeros((len(datas), 6)) for m in composed.sensors}
         self._unconverged = np.zeros(len(datas), int)
         """Steps of the solver since the reset that did not meet its tolerance."""
@@ -160,7 +166,7 @@ class SoftPads:
         Raises ``InputError``: the only environment moves too fast; it has failed then, until it is reset.
         """
         scene, timestep, datas = self._scene, self.composed.timestep, self._datas
-        interval, since, reports = round(scene.soft_timestep / timestep), 0, []
+        interval, since, reports = round(scene.soft_timestep / timestep), np.zeros(len(datas), int), []
         steps = round(scene.control_timestep / timestep)
         for step in range(1, steps + 1):
             for b, data in enumerate(datas):
@@ -169,15 +175,12 @@ class SoftPads:
             since += 1
             cases, driven = self._now(datas, failed)
             # Before a contact begins, the solver steps early, so that MuJoCo has the contact's force before the bodies overlap far.
-            early = (
-                self._coupling is not None
-                and since < interval
-                and step < steps
-                and not self.soft.is_small(cases, driven, since * timestep)
-            )
-            if since == interval or step == steps or early:
-                reports.append(self._follow(datas, failed, cases, driven, since * timestep))
-                since = 0
+            due = (since == interval) | (step == steps)
+            if self._coupling is not None and not due.all():
+                due |= ~self.soft.is_small(cases, driven, since * timestep)
+            if due.any():
+                reports.append(self._follow(datas, failed, cases, driven, since * timestep, due))
+                since[due] = 0
         whole = reduce(SceneReport.then, reports)
         failed |= ~whole.last_converged
         if (failed & ~self.soft.failed).any():
@@ -203,12 +206,38 @@ class SoftPads:
         wrench = np.where(failed[:, None], np.nan, self._wrench[name])
 
         def traction(_: GelSurface) -> np.ndarray:
-            if name not in self._traction:
-                self._traction[name] = CoatTraction(self.soft.pads[name].mesh.coat, grid)
-            return self._traction[name](reading.forces)
+            return self._traction_on(name, grid)(reading.forces)
 
         result = PadReading(reading.surface, wrench, failed, traction, unconverged=self._unconverged.copy())
         return result if envs is None else result.of(envs)
+
+    def arrays(self, name: str, grid: PadGrid, failed: np.ndarray, markers: np.ndarray | None = None) -> WarpFrame:
+        """Readings of one sensor as arrays of the solver's device; the next reading overwrites them.
+
+        ``markers``: places of markers at rest (M, 2) [m], which move with the coat; None without.
+        """
+        mesh, device = self.soft.pads[name].mesh.coat, self.soft.world.device
+        shown = self.soft.arrays(name, grid, failed)
+        displacement = None
+        if markers is not None:
+            if name not in self._markers:
+                self._markers[name] = CoatMarkers(mesh, markers, len(failed), device)
+            displacement = self._markers[name].launch(shown.coat)
+        lost = failed | self.soft.failed
+        wrench = np.where(lost[:, None], np.nan, self._wrench[name])
+        return WarpFrame(
+            wp.array(wrench, dtype=wp.float64, device=device),
+            wp.array(~lost, dtype=wp.bool, device=device),
+            shown.height,
+            shown.contact,
+            displacement,
+            self._traction_on(name, grid).launch(shown.forces),
+        )
+
+    def _traction_on(self, name: str, grid: PadGrid) -> CoatTraction:
+        if name not in self._traction:
+            self._traction[name] = CoatTraction(self.soft.pads[name].mesh.coat, grid, self.soft.world.device)
+        return self._traction[name]
 
     def overlap(self, env: int) -> list[tuple[str, str, float]]:
         """Overlaps at the start: an empty list, since the solver raises an error for them."""
@@ -246,17 +275,25 @@ class SoftPads:
         return cases, {name: np.where(failed[:, None, None], self._last_driven[name], pose) for name, pose in now.items()}
 
     def _follow(
-        self, datas: Sequence[mujoco.MjData], failed: np.ndarray, cases: np.ndarray, driven: dict[str, np.ndarray], dt: float
+        self,
+        datas: Sequence[mujoco.MjData],
+        failed: np.ndarray,
+        cases: np.ndarray,
+        driven: dict[str, np.ndarray],
+        dt: np.ndarray,
+        due: np.ndarray,
     ) -> SceneReport:
-        """Step the solver to MuJoCo's present poses."""
+        """Step the solver by ``dt`` (B,) [s] to MuJoCo's poses, in environments ``due`` (B,)."""
         try:
-            report = self.soft.step(cases, driven, dt)
+            report = self.soft.step(cases, driven, dt, due)
         except InputError:
             failed[:] = True  # MuJoCo is ahead of the solver
             raise
-        self._last_cases, self._last_driven = cases, driven
+        self._last_cases[due] = cases[due]
+        for name, pose in driven.items():
+            self._last_driven[name][due] = pose[due]
         failed |= report.failed
-        alive = np.flatnonzero(~failed).tolist()
+        alive = np.flatnonzero(due & ~failed).tolist()
         self._mirror(datas, alive)
         if self._coupling is not None:
             inputs = coupling_inputs(self.soft, self._felt)
@@ -267,7 +304,7 @@ class SoftPads:
         for k, mounted in enumerate(self.composed.sensors):
             turn, world = cases[:, k, :3, :3], self.soft.wrench(mounted.name)
             split = [np.einsum("bji,bj->bi", turn, world[:, at : at + 3]) for at in (0, 3)]
-            self._wrench[mounted.name] = np.concatenate(split, axis=1)
+            self._wrench[mounted.name][due] = np.concatenate(split, axis=1)[due]
         return report
 
     def _mirror(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray) -> None:

@@ -12,6 +12,7 @@ from raytac.checks import MOST_ENVIRONMENTS, check_known, check_whole
 from raytac.frame import TactileFrame
 from raytac.gel.surface import chosen_envs
 from raytac.physics.base import PadReading
+from raytac.physics.registry import rigid_physics
 from raytac.physics.rigid.contacts import LoadTables
 from raytac.physics.rigid.pierced import BondedFaces
 from raytac.physics.rigid.search import PadSearch
@@ -24,6 +25,7 @@ from raytac.world.world_model import checked_states, own_world_model
 
 if TYPE_CHECKING:
     from raytac.gel.surface import PadGrid
+    from raytac.physics.base import PhysicsConfig
     from raytac.robots.mount import SensorChoice
     from raytac.sensor import SensorSettings
     from raytac.world.touched import TouchChoice
@@ -66,6 +68,7 @@ class TactileReader:
         num_envs: int = 1,
         allow_overlap: Sequence[str] = (),
         keyframe: str | None = None,
+        physics: str | PhysicsConfig | None = None,
         seed: int = 0,
         **settings: Unpack[SensorSettings],
     ) -> None:
@@ -77,12 +80,14 @@ class TactileReader:
             depth: one of ``DEPTHS``.
             num_envs: number of states B that are read together.
             allow_overlap, keyframe: as of ``TactileWorld``: at this start, or ``qpos0``, no gel may lie in a geom that is not touched.
+            physics: name or configuration of rigid pads; None is ``rigid``.
             seed: of every random number.
             settings: ``outputs``, ``markers``, ``optics``, ``resolution``, ``device`` and ``pitch`` of every sensor.
 
         Raises:
-            InputError: no sensor, a gel that does not collide, and what ``TactileWorld`` refuses of bodies.
+            InputError: no sensor, a gel that does not collide, and what ``TactileWorld`` refuses of bodies, or soft pads.
         """
+        config = rigid_physics(physics)
         check_known("depth", depth, DEPTHS)
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
         self.model, self.depth = model, depth
@@ -91,7 +96,7 @@ class TactileReader:
         )
         self.failed = np.zeros(num_envs, bool)
         sensors_, bodies = self.composed.sensors, self.composed.touched
-        self._frames = SensorFrames(sensors_, num_envs=num_envs, seed=seed, **settings)
+        self._frames = SensorFrames(sensors_, num_envs=num_envs, seed=seed, physics=config, **settings)
         shapes = [body.parts for body in bodies]
         self._surfaces = PadSurfaces({mounted.name: mounted.spec.gelpad for mounted in sensors_}, shapes, num_envs)
         self._faces = {mounted.name: BondedFaces.on_cpu([mounted.spec.gelpad], shapes) for mounted in sensors_}
@@ -120,27 +125,39 @@ class TactileReader:
         self._frames.reset(chosen)
 
     def read(
-        self, datas: mujoco.MjData | Sequence[mujoco.MjData], sensors: Sequence[str] | str | None = None
+        self,
+        datas: mujoco.MjData | Sequence[mujoco.MjData],
+        sensors: Sequence[str] | str | None = None,
+        envs: np.ndarray | list[int] | None = None,
     ) -> dict[str, TactileFrame]:
         """Frames of the sensor or sensors named (all if None), a row for each state.
 
-        Raises ``InputError``: another number of states, states of another model, or an unknown sensor; as ``TactileSensor.update``.
+        ``envs`` (a mask (B,) or a list): rows of these states alone, as of ``TactileWorld.observe``; all states are given, and the others
+        keep their ``failed``.
+
+        Raises ``InputError``: another number of states, states of another model, an unknown sensor or state; as ``TactileSensor.update``.
         """
         states = checked_states(self.model, self.model, datas, len(self.failed))
-        self.failed[:] = [not np.isfinite(data.qpos.sum() + data.qvel.sum()) for data in states]
+        for b in chosen_envs(envs, len(states)):
+            self.failed[b] = not np.isfinite(states[b].qpos.sum() + states[b].qvel.sum())
         mounted = {one.name: one for one in self.composed.sensors}
         return self._frames.observe(
-            lambda name, grid, _: self._reading(mounted[name], grid, states, self.failed), self.failed, sensors, None
+            lambda name, grid, rows: self._reading(mounted[name], grid, states, rows), self.failed, sensors, envs
         )
 
-    def _reading(self, mounted: MountedSensor, grid: PadGrid, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> PadReading:
+    def _reading(
+        self, mounted: MountedSensor, grid: PadGrid, states: Sequence[mujoco.MjData], envs: Sequence[int] | None
+    ) -> PadReading:
+        """Reading of one sensor, a row for each of ``envs`` (None: all states)."""
+        rows = np.arange(len(states)) if envs is None else np.asarray(envs)
+        datas, failed = [states[b] for b in rows], self.failed[rows]
         world_from_pad = site_poses(datas, int(self.model.site(mounted.site).id))
         pad_from_body = inverse(world_from_pad)[:, None] @ body_poses(datas, self._body_index)
         wrench, load = self._forces(mounted, datas, world_from_pad)
         failed |= self._faces[mounted.name].pierced(pad_from_body[:, None]).any(axis=(1, 2))
         if self.depth == "force":
             self._settle(mounted, pad_from_body, load, failed)
-        return self._surfaces.reading(mounted.name, grid, pad_from_body, wrench, failed, np.arange(len(datas)))
+        return self._surfaces.reading(mounted.name, grid, pad_from_body, wrench, failed, rows)
 
     def _forces(
         self, mounted: MountedSensor, datas: Sequence[mujoco.MjData], world_from_pad: np.ndarray

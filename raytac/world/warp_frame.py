@@ -34,6 +34,8 @@ class WarpFrame:
     """1 where something touches, (B, Ny, Nx), uint8."""
     markers: wp.array | None = None
     """Displacements of the markers along x, y [m], (B, M, 2), float32."""
+    traction: wp.array | None = None
+    """Force per area at rest on a soft pad, pad frame [Pa], (B, Ny, Nx, 3), float32."""
 
     def torch(self) -> dict[str, torch.Tensor]:
         """Tensors by name, which share the arrays' memory. Raises ``InputError`` without PyTorch."""

@@ -7,7 +7,7 @@ from copy import copy
 from functools import partial
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import mujoco
 import numpy as np
@@ -16,6 +16,8 @@ from raytac.checks import MOST_ENVIRONMENTS, check_known, check_numbers, check_w
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.gel.surface import chosen_envs
+from raytac.markers.config import SurfaceMarkers
+from raytac.markers.pattern import MarkerPattern
 from raytac.markers.registry import markers_config
 from raytac.physics.base import PhysicsConfig
 from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode, OpticsConfig
     from raytac.physics.soft.scene import SoftScene
     from raytac.robots.mount import SensorChoice
+    from raytac.world.soft_pads import SoftPads
     from raytac.world.touched import TouchChoice
     from raytac.world.warp_frame import WarpFrame
 
@@ -179,6 +182,7 @@ class TactileWorld:
             physics=self.physics,
             pitch=pitch,
         )
+        self._markers = None if markers is None else markers_config(markers)
         self.model = self.composed.model
         self.arm: Arm | None = self.composed.arm
         if isinstance(self.engine, WarpEngine):
@@ -186,9 +190,8 @@ class TactileWorld:
 
             felt = "height" in ((outputs,) if isinstance(outputs, str) else outputs) or markers is not None
             grids = {one: sensor.grid for one, sensor in self._frames.sensors.items()} if felt else {}
-            model = None if markers is None else markers_config(markers)
             self._states: CStates | WarpStates = WarpStates(
-                self.composed, num_envs, self.engine, device, grids=grids, markers=model
+                self.composed, num_envs, self.engine, device, grids=grids, markers=self._markers
             )
         else:
             pads = partial(WORLD_PADS.config_class(name), physics=self.physics, coupling=self.coupling, device=device)
@@ -367,16 +370,24 @@ class TactileWorld:
             self._states.fail(failed)
 
     def read(self, name: str) -> WarpFrame:
-        """Readings of one sensor with MuJoCo Warp: arrays on the device.
+        """Readings of one sensor with MuJoCo Warp or soft pads: arrays on the device.
 
-        They are those after the last step or reset, and nothing is copied. The height is there if ``outputs`` or markers ask for it.
-        Another gel that presses is not in it, as it is in the frames of ``observe``.
+        They are those after the last step or reset, and nothing is copied. With MuJoCo Warp the height is there if ``outputs`` or markers
+        ask for it, and another gel that presses is not in it, as it is in the frames of ``observe``. A soft pad has height, contact and
+        traction, and the displacements of ``surface`` markers; the next reading overwrites them.
 
-        Raises ``InputError`` for an unknown sensor, or with C MuJoCo.
+        Raises ``InputError`` for an unknown sensor, or of rigid pads with C MuJoCo.
         """
         if name not in self.sensor_names:
             raise InputError("sensor", value=name, rule="must be a sensor of the world", choices=self.sensor_names)
-        return self._states.read(name)
+        if self._pads.soft is None:
+            return self._states.read(name)
+        sensor, pads, places = self._frames.sensors[name], cast("SoftPads", self._pads), None
+        if isinstance(self._markers, SurfaceMarkers):
+            if self._markers.perturbation is not None:
+                raise InputError("perturbation", value=self._markers.perturbation, rule="must be None on the device")
+            places = MarkerPattern.of(sensor.spec).rest[0, :, :2]
+        return pads.arrays(name, sensor.grid, self._states.failed.copy(), places)
 
     def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Present surface of a body or soft pad: vertices (B, n, 3) [m], world, and faces (F, 3).

@@ -112,6 +112,27 @@ def test_coulomb_binds_where_a_block_lands_on_a_turning_table(offset: float, spe
         assert moving <= 1.02 * mu * 9.81 * (k + 1) * world.settings.dt
 
 
+def landed(steps: int, moves: str) -> np.ndarray:
+    """Force on a plate that goes 0.1 mm along x and 0.3 mm down, the first half in the air; or the pad goes to it."""
+    plate = ipc.KinematicBody("plate", ipc.box_surface((4e-3, 4e-3, 1e-3)), ipc.Pose((0.0, 0.0, 0.7e-3)))
+    settings = ipc.Settings(d_hat=5e-5, friction=1.0, velocity_tolerance=1e-5)
+    world = ipc.World([bonded_pad(small_pad()), plate], settings, device="cpu")
+    begin, way = world.frame(moves)[1][0], np.array([1e-4, 0.0, -3e-4]) * (1.0 if moves == "plate" else -1.0)
+    for k in range(1, steps + 1):
+        world.set_target(moves, begin + way * k / steps)
+        assert world.step().converged[0]
+    return world.wrench("plate").force[0]
+
+
+@pytest.mark.parametrize("moves", ["plate", "pad"])
+def test_what_lands_at_a_slant_drags_along_only_from_where_it_lands(moves: str) -> None:
+    """In one step as in many, though the step begins in the air."""
+    one, many = landed(1, moves), landed(4, moves)
+    assert one[2] == pytest.approx(many[2], rel=0.005)
+    assert -one[0] == pytest.approx(-many[0], rel=0.02) and -many[0] > 0.05 * many[2]
+    assert abs(one[1]) < 0.01 * abs(one[0])
+
+
 def test_a_step_whose_friction_does_not_settle_says_so() -> None:
     world, settled = block_over_table(friction_relags=2), []
     for k in range(1, 7):

@@ -140,6 +140,39 @@ def test_batch_equals_singles() -> None:
         assert difference == 0.0, f"environment {i} is off by {difference:.3g} m"
 
 
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+def test_environments_take_steps_of_their_own_length_or_none(device: str) -> None:
+    """One presses in whole steps, one in halves, one stands still from the second step on; each as a world of its own does."""
+    depth = np.array([0.25e-3, 0.25e-3, 0.2e-3])
+    batch = make_world(3, friction=0.5, device=device, deterministic=True)
+    singles = [make_world(1, friction=0.5, device=device, deterministic=True) for _ in depth]
+    start = batch.frame("ball")[1]
+    halves = np.array([1.0, 0.5, 0.5])
+    share = np.zeros(3)
+    for k, stepped in enumerate(([0, 1, 2], [1], [0, 1], [1])):
+        share[stepped] += halves[stepped]
+        target = start + np.column_stack([0.1e-3 * share, 0.0 * share, -depth * share])
+        before = batch.save()
+        batch.set_target("ball", target)
+        report = batch.step(0.01 * halves, stepped)
+        rest = np.setdiff1d(range(3), stepped)
+        assert report.converged.all() and (report.newton[stepped] > 0).all() and (report.newton[rest] == 0).all()
+        assert (report.blocked == 0.0).all()
+        after = batch.save()
+        for name in ("y", "velocity", "frame_position"):
+            assert np.array_equal(getattr(before, name)[rest], getattr(after, name)[rest])
+        for env in stepped:
+            singles[env].set_target("ball", target[env])
+            singles[env].step(0.01 * halves[env])
+        for env, single in enumerate(singles):  # those that were not stepped keep their forces
+            assert np.array_equal(batch.positions("pad")[env], single.positions("pad")[0]), k
+            assert np.array_equal(batch.contact_forces("pad")[env], single.contact_forces("pad")[0]), k
+    assert np.abs(batch.wrench("ball").force[:, 2]).min() > 0.01
+    with pytest.raises(ipc.IpcError, match=r"dt = .*positive"):
+        batch.step([0.01, 0.0, 0.01], [0, 1])
+    batch.step([0.01, 0.0, 0.01], [0, 2])
+
+
 def test_reset_in_contact_is_a_fresh_start() -> None:
     world = make_world(num_envs=2, friction=0.5)
     press(world, 0.5e-3, 4, side=1e-4)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from raytac import InputError, PadStepper, TactileReader, TactileWorld, mount
+from raytac.physics import Ipc
 from raytac.physics.rigid.pad import RigidPad
 from raytac.specs import ObjectSpec, PressScene, StageSpec, load_sensor
 from tests.world.arm6 import arm6, with_sensors
@@ -141,3 +142,39 @@ def test_what_a_foreign_loop_cannot_be_given() -> None:
         pads.wrench("left")
     with pytest.raises(InputError, match=r"model\.opt\.cone = 'pyramidal'"):
         PadStepper(lying(option='cone="pyramidal"'))
+
+
+def test_soft_pads_are_refused_in_a_loop_that_steps_no_solver() -> None:
+    for make, model in ((PadStepper, lying()), (TactileReader, lying(collide=True))):
+        for physics in ("ipc", Ipc()):
+            with pytest.raises(InputError, match=r"physics = .*must be rigid.*TactileWorld.*choose from: rigid"):
+                make(model, outputs=(), physics=physics)
+        with pytest.raises(InputError, match="physics = .*ipv"):
+            make(model, outputs=(), physics="ipv")
+        make(model, outputs=(), physics="rigid")
+
+
+def test_some_states_are_read_as_all_of_them_are() -> None:
+    """Rows in the order of the list, those that are not named keep what was said of them."""
+    model = lying(collide=True)
+    datas = [mujoco.MjData(model) for _ in range(3)]
+    for depth, data in zip((0.1e-3, 0.2e-3, 0.4e-3), datas, strict=True):
+        data.qpos[2] = 5e-3 - depth
+        mujoco.mj_forward(model, data)
+    outputs = {"outputs": ("wrench", "height"), "pitch": 0.4e-3, "num_envs": 3}
+    reader, pads = TactileReader(model, **outputs), PadStepper(lying(), **outputs)
+    for _ in range(2):
+        pads.step(pads.model, datas := [*datas])
+    whole, seen = TactileReader(model, **outputs).read(datas)["sensor"], pads.observe(datas)["sensor"]
+    datas[0].qpos[0] = np.nan
+    for frame, every in ((reader.read(datas, envs=[2, 1])["sensor"], whole), (pads.observe(datas, envs=[2, 1])["sensor"], seen)):
+        assert frame.surface.height.shape[0] == 2
+        np.testing.assert_array_equal(frame.surface.height, every.surface.height[[2, 1]])
+        np.testing.assert_array_equal(frame.wrench, every.wrench[[2, 1]])
+    assert not np.array_equal(whole.surface.height[1], whole.surface.height[2]) and not reader.failed.any()
+    reader.read(datas, envs=np.array([True, False, False]))
+    assert reader.failed.tolist() == [True, False, False]
+    reader.read(datas, envs=[1])
+    assert reader.failed.tolist() == [True, False, False]
+    with pytest.raises(InputError, match="envs"):
+        reader.read(datas, envs=[3])

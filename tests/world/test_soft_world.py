@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+import warp as wp
 
 from raytac.errors import InputError, OverlapError, SpecError
 from raytac.physics.soft.scene import SoftScene
@@ -20,6 +21,12 @@ G = 9.81
 BALL = BodySpec("ball", "sphere", {"radius": 0.005}, position=(0.0, 0.0, 0.0051), mass=0.05)
 UP = TaskScene("upward", RobotSpec("fixed_sensor"), (BALL,), physics="ipc", coupling="one_way")
 """A sensor that lies on its back with a ball just above the middle of its pad; world and pad frame are one."""
+
+
+DEVICES = [
+    "cpu",
+    pytest.param("cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not wp.is_cuda_available(), reason="needs CUDA")]),
+]
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +58,34 @@ def test_the_sensor_reads_the_soft_pad(resting: TactileWorld) -> None:
     np.testing.assert_allclose(total, resting.state().wrench["sensor"][0, :3], atol=2e-3)
     assert frame.surface.contact.any() and np.abs(frame.surface.contact_centre).max() < 1e-4
     assert frame.surface.grid.shape == resting.sensors["sensor"].grid.shape
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_soft_pad_gives_arrays_of_its_device_without_copies(device: str) -> None:
+    """What ``read`` has is what ``observe`` shows, in memory that other libraries share and the next reading overwrites."""
+    dotted = replace(UP, robot=RobotSpec("fixed_sensor", "gelsight_mini_7x9"))
+    world = TactileWorld(dotted, outputs=("height", "wrench", "traction"), markers="surface", num_envs=2, device=device)
+    for _ in range(3):
+        world.step()
+    frame = world.read("sensor")
+    arrays, seen = frame.numpy(), world.observe()["sensor"]
+    assert set(arrays) == {"wrench", "active", "height", "contact", "markers", "traction"} and arrays["active"].all()
+    np.testing.assert_array_equal(arrays["height"], seen.height)
+    np.testing.assert_array_equal(arrays["contact"].astype(bool), seen.surface.contact)
+    np.testing.assert_array_equal(arrays["wrench"], seen.wrench)
+    np.testing.assert_array_equal(arrays["traction"], seen.traction)
+    assert np.abs(arrays["wrench"][:, 2]).min() > 0.1 and arrays["contact"].any(axis=(1, 2)).all()
+    assert frame.height is not None
+    tracked = seen.markers.displacement[..., :2]
+    assert np.abs(arrays["markers"] - tracked).max() < 1e-9 and np.abs(tracked).max() > 1e-6
+    heights: Any = np.from_dlpack(frame.height) if device == "cpu" else None
+    world.reset()
+    again = world.read("sensor")
+    assert again.height is not None and again.height.ptr == frame.height.ptr
+    assert np.abs(again.numpy()["height"] - arrays["height"]).max() > 1e-5
+    assert heights is None or np.array_equal(heights, again.numpy()["height"])  # memory that NumPy shares
+    with pytest.raises(InputError, match=r"sensor = 'finger'.*sensor of the world"):
+        world.read("finger")
 
 
 def test_some_environments_read_as_all_of_them_do() -> None:

@@ -8,7 +8,8 @@ import warp as wp
 from ipc.bodies.layout import Layout
 from ipc.errors import IpcError
 from ipc.settings import Settings
-from ipc.solver.linear import BlockJacobi, Preconditioner
+from ipc.solver.block_jacobi import BlockJacobi
+from ipc.solver.linear import Preconditioner
 from ipc.solver.preconditioners.rest_inverse import RestInverse
 from ipc.solver.preconditioners.rest_stiffness import bonded_bodies
 from ipc.solver.preconditioners.substructure import MAX_ENTRIES, choose_partition, entries
@@ -59,4 +60,4 @@ def make_preconditioner(layout: Layout, settings: Settings, batch: int, lanes: i
                 rule = "a rest matrix is too ill-conditioned to be inverted in single precision"
         if must:
             raise IpcError(f"preconditioner = {name!r}: {rule}; choose 'block_jacobi' or 'auto'")
-    return BlockJacobi(batch, len(layout.node_rest), lanes, device)
+    return BlockJacobi(layout, batch, lanes, device)

@@ -19,8 +19,8 @@ import warp as wp
 
 from ipc.arrays import IntArray, IntArray2d, MatArray2d, SingleArray2d, SingleArray3d
 from ipc.contact.contacts import Contacts, mat34d, rows_of
+from ipc.solver.blocks import wait_for_block
 from ipc.solver.linear import SystemView, row_column
-from ipc.solver.pcg_block import wait_for_block
 
 wp.set_module_options({"enable_backward": False})
 

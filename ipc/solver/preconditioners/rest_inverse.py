@@ -19,7 +19,8 @@ from ipc.arrays import IntArray, MatArray2d, SingleArray2d, SingleArray3d, VecAr
 from ipc.bodies.layout import Layout
 from ipc.contact.contacts import Contacts
 from ipc.settings import Settings
-from ipc.solver.linear import BlockJacobi, SystemView
+from ipc.solver.block_jacobi import BlockJacobi
+from ipc.solver.linear import SystemView
 from ipc.solver.preconditioners.low_rank import LANES, LowRank, Rest, Small, fits, rest_entry, sum_of_parts
 from ipc.solver.preconditioners.rest_stiffness import bonded_bodies, rest_blocks
 from ipc.solver.preconditioners.substructure import Patch, choose_partition, condense
@@ -274,7 +275,7 @@ class RestInverse:
             Product(view, self.x, self.y, int(first), int(first), batch) for view, first in zip(views, firsts, strict=False)
         ]
         self._lay_out_patches([patch for body in bodies for patch in body.patches], count)
-        self.jacobi = BlockJacobi(batch, count, lanes, device)
+        self.jacobi = BlockJacobi(layout, batch, lanes, device, eliminate=False)
 
     def _vectors(self, inputs: int, outputs: int) -> tuple[wp.array, wp.array]:
         """Padded inputs (B, inputs) and parts of outputs (parts, B, outputs) of a product."""

@@ -30,6 +30,8 @@ BODY_KINDS = ("kinematic", "affine", "soft", "half_space")
 """Kinds that ``scene_body`` makes."""
 _DRIVEN_SHARE = 0.2
 """Share of a soft object's height, from its top, that is driven."""
+_OWN_VOLUME = 0.25
+"""λ'/μ of a soft object's tetrahedra in their blocks, as of ``PadLevel.own_volume``."""
 
 
 @dataclass(frozen=True)
@@ -153,8 +155,8 @@ def object_body(
     """The object of a press scene as a body of the solver, in the object's frame.
 
     ``kinematic``: a driven rigid surface, without the triangles that no press brings near the pad. ``affine``: free and near-rigid,
-    with a ``weight``; its surface must be closed. ``soft``: neo-Hookean, tetrahedra of about ``edge_length``, driven by the fifth of its
-    height that is farthest from the pad.
+    with a ``weight``; its surface must be closed. ``soft``: neo-Hookean, tetrahedra of about ``edge_length`` in volume blocks, driven by
+    the fifth of its height that is farthest from the pad.
 
     Args:
         parts, spec: shape; kind of body, and a soft one's material.
@@ -189,7 +191,11 @@ def object_body(
             height = tets.vertices @ rotations[0, 2]
             driven = np.flatnonzero(height >= height.max() - _DRIVEN_SHARE * np.ptp(height))
             material = ipc.Material(young=spec.youngs_modulus, poisson=spec.poisson_ratio)
-            return SceneBody(ipc.SoftBody(OBJECT, tets, material, bonded=driven), skin=SoftSkin(parts, tets))
+            # Without blocks a ball of 430 kPa is a sixth to a third too stiff in contact.
+            solid = ipc.SoftBody(
+                OBJECT, tets, material, bonded=driven, volume_blocks=ipc.patch_blocks(tets), own_volume=_OWN_VOLUME
+            )
+            return SceneBody(solid, skin=SoftSkin(parts, tets))
     except ipc.IpcError as error:
         raise InputError("object.dynamics", value=spec.dynamics, rule=f"cannot be made from this object: {error}") from error
     raise InputError("object.dynamics", value=spec.dynamics, rule="must be a known kind of body", choices=DYNAMICS)

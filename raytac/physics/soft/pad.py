@@ -10,16 +10,17 @@ import numpy as np
 
 from raytac.errors import InputError, SpecError
 from raytac.gel.surface import GelSurface
-from raytac.gel.traction import CoatTraction
 from raytac.io.progress import Progress
 from raytac.physics.base import PadReading
 from raytac.physics.press import CLEARANCE, PressPad, PressSettings
 from raytac.physics.soft.bodies import object_body
+from raytac.physics.soft.coat_points import CoatTraction
+from raytac.physics.soft.coat_state import CoatState
 from raytac.physics.soft.mesh import PadMesh, pad_mesh
 from raytac.physics.soft.placement import PressPlacement
 from raytac.physics.soft.press_controller import PressController
 from raytac.physics.soft.press_solver import PressSolver
-from raytac.physics.soft.reading import CoatState, SoftReader, SoftReading
+from raytac.physics.soft.reading import SoftReader, SoftReading
 from raytac.physics.soft.settings import DEFAULT_CONTROL, DEFAULT_CORRECTION, Correction, PressControl
 from raytac.specs.press import PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
@@ -151,7 +152,7 @@ class SoftPad(PressPad):
     def _at_rest(self) -> SoftReading:
         """The coat without an object."""
         vertices = np.repeat(self.mesh.coat.rest[None], self.num_envs, axis=0)
-        return self._reader.read(CoatState(vertices, np.zeros_like(vertices), ()), np.zeros(self.num_envs, bool))
+        return self._reader.read(CoatState.of(vertices, np.zeros_like(vertices)), np.zeros(self.num_envs, bool))
 
     @property
     def _deepest(self) -> float:

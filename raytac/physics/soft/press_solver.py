@@ -7,8 +7,8 @@ import numpy as np
 import ipc
 from raytac.errors import OverlapError, RaytacError
 from raytac.physics.soft.bodies import OBJECT, PAD, SceneBody, ScenePad
+from raytac.physics.soft.coat_state import CoatState, ContactObject
 from raytac.physics.soft.mesh import PadMesh
-from raytac.physics.soft.reading import CoatState, ContactObject
 from raytac.physics.soft.scene import SoftScene
 from raytac.physics.soft.scene_state import SceneReport
 from raytac.physics.soft.settings import PressControl
@@ -41,6 +41,7 @@ class PressSolver:
         except OverlapError as error:
             raise RaytacError(f"the object overlaps the pad where it starts, 1 mm above the first touch: {error}") from error
         self._world_from_pad = identity
+        self._state: CoatState | None = None
         self.converged: np.ndarray = np.ones(len(start), bool)
         """True where the last step of an environment met its tolerance, shape (B,)."""
         self.unconverged: np.ndarray = np.zeros(len(start), int)
@@ -107,10 +108,16 @@ class PressSolver:
         return -self.forces()[:, :, 2].sum(axis=1)
 
     def coat_state(self, driven: np.ndarray) -> CoatState:
-        """Coat, forces and object for a reader; ``driven``: ``pad_from_object`` (B, 4, 4) or None."""
+        """Coat, forces and object for a reader; ``driven``: ``pad_from_object`` (B, 4, 4) or None.
+
+        The next call overwrites it.
+        """
         free = not self.body.is_driven
         pose = inverse(self._world_from_pad) @ self.scene.pose(OBJECT) if free else driven
         surface = self.scene.skin(OBJECT, PAD) if self.body.is_soft else None
-        return CoatState(
-            self.scene.coat(PAD), self.forces(), (ContactObject(self.body.parts, pose, surface, None, self._friction),)
-        )
+        if self._state is None:
+            touched = ContactObject(self.body.parts, pose, surface, None, self._friction)
+            self._state = CoatState.of(self.scene.coat(PAD), self.forces(), (touched,), self.world.device)
+        else:
+            self._state.update(self.scene.coat(PAD), self.forces(), pose, None if surface is None else surface[0])
+        return self._state

@@ -1,99 +1,39 @@
-"""Reading of a soft pad: surface, contact and forces from the solver's state."""
+"""Reading of soft pads: surface, contact and forces from the solver's state, on its device."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
+import warp as wp
 
 from raytac.gel.coat_mesh import DeformedCoat
-from raytac.gel.interpolate import hat_matrix, sampled
-from raytac.gel.matmul import sandwich
-from raytac.gel.surface import GelSurface, PadGrid, make_grid, rest_height
-from raytac.physics.soft.coat_surface import BarrierClearance, CoatPlaces, CoatSurface
+from raytac.gel.products import Products
+from raytac.gel.surface import GelSurface, PadGrid, make_grid
+from raytac.physics.soft import reading_kernels as kernels
+from raytac.physics.soft.clearance import BarrierClearance, hat_arrays
+from raytac.physics.soft.coat_state import CoatState
+from raytac.physics.soft.coat_surface import CoatSurface
+from raytac.physics.soft.correction import normal_kernels
 from raytac.physics.soft.correction.mesh_compliance import coat_compliance
 from raytac.physics.soft.correction.normal import ContactSampler, NormalCorrection
+from raytac.physics.soft.correction.plane_waves import node_lines
 from raytac.physics.soft.correction.tangential import TangentialCorrection
 from raytac.physics.soft.mesh import PadMesh
 from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
-from raytac.shapes.part import Part, mesh_part
-from raytac.shapes.underside import object_height
+from raytac.physics.soft.undersides import Undersides
 from raytac.specs.sensor import GelpadSpec
+from raytac.warp_runtime import LAUNCH, Recorded, start_warp
 
 _SAMPLE = 0.2e-3
 """Spacing of the samples at which the clearance is measured [m]."""
-_BEHIND = 1e-3
-"""Overlap [m] beyond that of any contact: the object is beside or behind the pad."""
 
 
 class UnsolvedContactWarning(UserWarning):
     """The search for the contact below the size of a cell ended before it converged."""
-
-
-@dataclass(frozen=True)
-class ContactObject:
-    """One object that B pads may touch; pad frame."""
-
-    parts: Sequence[Part]
-    """Exact shape of a rigid object, object frame; empty for a soft one."""
-    poses: np.ndarray
-    """``pad_from_object``, (B, 4, 4)."""
-    surface: tuple[np.ndarray, np.ndarray] | None = None
-    """Present vertices (B, n, 3) [m] and faces of a soft object."""
-    touching: np.ndarray | None = None
-    """Mask (B,) of the environments in which it touches, else it may lie behind; None: all."""
-    friction: float | None = None
-    """Coulomb's coefficient on the pad; None: not known, friction is shown as the mesh has it."""
-
-    def touches(self, b: int) -> bool:
-        return self.touching is None or bool(self.touching[b])
-
-    def shape(self, b: int, lowered: float = 0.0) -> tuple[Sequence[Part], np.ndarray]:
-        """Parts and their pose (4, 4) over pad ``b``, ``lowered`` along z [m]."""
-        pose = self.poses[b].copy() if self.surface is None else np.eye(4)
-        pose[2, 3] -= lowered
-        return (self.parts if self.surface is None else (mesh_part(self.surface[0][b], self.surface[1]),)), pose
-
-
-@dataclass(frozen=True)
-class CoatState:
-    """The solver's state of B copies of one pad's coat; pad frame."""
-
-    vertices: np.ndarray
-    """Vertices of the coat [m], shape (B, V, 3)."""
-    forces: np.ndarray
-    """Contact force on each of them [N], shape (B, V, 3)."""
-    objects: tuple[ContactObject, ...]
-
-    def is_finite(self) -> np.ndarray:
-        """Mask (B,) of the environments in which every number is finite."""
-        arrays = [self.vertices, self.forces]
-        for thing in self.objects:
-            arrays += [thing.poses] if thing.surface is None else [thing.poses, thing.surface[0]]
-        return np.all([np.isfinite(values).all(axis=(1, 2)) for values in arrays], axis=0)
-
-    def underside(
-        self, b: int, x: np.ndarray, y: np.ndarray, below: float, soft_below: float = np.inf, lowered: float = 0.0
-    ) -> np.ndarray:
-        """Underside over pad ``b`` at lines ``x``, ``y`` [m], (Ny, Nx), ``lowered`` [m]; or inf.
-
-        What lies wholly above ``below`` may be missing, of soft objects above ``soft_below`` [m].
-        """
-        under = np.full((len(y), len(x)), np.inf)
-        for thing in self.objects:
-            if thing.touches(b):
-                parts, pose = thing.shape(b, lowered)
-                limit = below if thing.surface is None else soft_below
-                np.minimum(under, object_height(parts, pose[None], x, y, below=limit)[0], out=under)
-        return under
-
-    def friction(self, b: int) -> float | None:
-        """Coulomb's coefficient if a single rigid object touches pad ``b``, else None."""
-        things = [thing for thing in self.objects if thing.touches(b)]
-        return things[0].friction if len(things) == 1 and things[0].surface is None else None
 
 
 @dataclass(frozen=True)
@@ -109,7 +49,7 @@ class SoftReading:
     clearance: np.ndarray
     """Mean distance that the barrier kept [m], shape (B,); NaN out of contact."""
     poses: tuple[np.ndarray, ...]
-    """``pad_from_object`` (B, 4, 4) of each object, lowered by the clearance."""
+    """``pad_from_object`` (B, 4, 4) of each object, rigid ones first, lowered by the clearance."""
     underside: np.ndarray
     """Underside of the objects over the grid [m], (B, Ny, Nx), inf where there is none.
 
@@ -122,116 +62,90 @@ class SoftReading:
     """Environments of which nothing is shown, (B,) bool: they failed, or are not finite."""
 
 
+@dataclass(frozen=True)
+class PadArrays:
+    """B pads as they are shown, as arrays of the device; the next reading overwrites them."""
+
+    height: wp.array
+    """z of the surface, pad frame [m], (B, Ny, Nx), float32.
+
+    This and the next five are NaN or 0 where ``failed``."""
+    contact: wp.array
+    """1 where an object touches, (B, Ny, Nx), uint8."""
+    centre: wp.array
+    """Mean place of the normal load [m], (B,) of ``vec2d``; NaN out of contact."""
+    coat: wp.array
+    """Vertices of the coat as they are shown [m], (B, V) of ``vec3d``."""
+    clearance: wp.array
+    """As of ``SoftReading``, (B,), float64."""
+    residual: wp.array
+    """As of ``SoftReading``, (B,), float64."""
+    underside: wp.array
+    """As of ``SoftReading``, (B, Ny, Nx), float64."""
+    vertices: wp.array
+    """The solver's own vertices of the coat [m], (B, V) of ``vec3d``."""
+    forces: wp.array
+    """Contact force on each of them [N], (B, V) of ``vec3d``."""
+    failed: wp.array
+    """Environments of which nothing is shown, (B,), bool."""
+
+
 class SoftReader:
-    """Reads one kind of pad, whatever touches it: one object or several, rigid or soft."""
+    """Reads one kind of pad, whatever touches it: one object or several, rigid or soft.
+
+    All environments are read at once, by kernels on the device that holds their state.
+    """
 
     def __init__(
         self, mesh: PadMesh, gelpad: GelpadSpec, grid: PadGrid, correction: Correction | None = DEFAULT_CORRECTION
     ) -> None:
-        """Prepare surfaces on ``grid``; without ``correction`` the spline through the vertices."""
+        """Show surfaces on ``grid``; without ``correction`` the spline through the vertices."""
+        start_warp()
         self.mesh, self.grid, self.correction, self._gelpad = mesh, grid, correction, gelpad
-        self._surface = CoatSurface(mesh.coat, gelpad)
-        self._rows, self._columns = (m.astype(np.float32) for m in self._surface.matrices(grid.x, grid.y))
-        self._rest, self._fine_grid = grid.rest.astype(np.float32), grid
-        if correction is not None and min(grid.pitch) <= 0.9 * correction.pitch:
-            self._fine_grid = make_grid(gelpad, correction.pitch)
+        self._batches: dict[tuple[int, str], _Batch] = {}
         self._warned = False
-        samples = make_grid(gelpad, max(_SAMPLE, *grid.pitch))
-        self._clearance = BarrierClearance(self._surface, samples.rest, samples.x, samples.y, mesh.d_hat)
 
     def clearance(self, state: CoatState) -> np.ndarray:
-        """Mean distance that the barrier keeps [m], shape (B,), NaN out of contact."""
-        return np.array([self._measure(state, b)[1] for b in range(len(state.vertices))])
+        """Mean distance that the barrier keeps [m], shape (B,), NaN out of contact; a copy."""
+        with LAUNCH:
+            return self._batch(state).measure(state).numpy().copy()
+
+    def launch(self, state: CoatState, failed: wp.array) -> PadArrays:
+        """Read every pad on the device; nothing is copied. ``failed``: (B,), bool.
+
+        From the second reading of the same arrays on, all kernels are launched as one recording.
+        """
+        with LAUNCH:
+            batch = self._batch(state)
+            wp.copy(batch.given, failed)
+            return batch.read(state)
 
     def read(self, state: CoatState, failed: np.ndarray) -> SoftReading:
-        """Surface, contact and forces of every pad; NaN where ``failed`` (B,) or not finite."""
-        coat, vertices, forces = state.vertices.copy(), state.vertices.copy(), state.forces.copy()
-        poses = tuple(thing.poses.copy() for thing in state.objects)
-        batch = len(coat)
-        clearance, residual = np.full(batch, np.nan), np.full(batch, np.nan)
-        height = np.empty((batch, *self.grid.shape), np.float32)
-        touched = np.zeros(height.shape, bool)
-        centre, undersides = np.full((batch, 2), np.nan), np.full(height.shape, np.inf)
-        failed = failed | ~state.is_finite()
-        for b in np.flatnonzero(~failed).tolist():
-            places, kept = self._measure(state, b)
-            height[b] = self._rest + sandwich(self._rows, self._surface.rise(places, self._upwards(state, b)), self._columns)
-            if not np.isfinite(kept):
-                undersides[b] = self._underside(state, b, self.grid)
-                continue
-            clearance[b] = kept
-            for pose in poses:
-                pose[b, 2, 3] -= kept
-            load = np.maximum(-forces[b, :, 2], 0.0)
-            if self.correction is None:
-                undersides[b] = self._underside(state, b, self.grid, kept, height[b])
-                touched[b] = self._bears(load) & (undersides[b] - height[b] < self.mesh.d_hat)
-            else:
-                height[b], touched[b], undersides[b], coat[b], residual[b] = self._correct(
-                    state, b, places, kept, height[b], load
-                )
-            centre[b] = load @ vertices[b, :, :2] / load.sum()
-        failed |= ~(np.isfinite(height).all(axis=(1, 2)) & np.isfinite(coat).all(axis=(1, 2)))
-        for shown in (coat, vertices, forces, height, clearance, residual, centre, *poses):
-            shown[failed] = np.nan
-        touched[failed], undersides[failed] = False, np.inf
+        """Surface, contact and forces of every pad, copied; NaN where ``failed`` (B,) or not finite."""
+        device: Any = state.vertices.device
+        shown = self.launch(state, wp.array(failed, dtype=wp.bool, device=device))
+        lost, clearance, residual, centre = map(_copied, (shown.failed, shown.clearance, shown.residual, shown.centre))
+        coat, vertices, forces = map(_copied, (shown.coat, shown.vertices, shown.forces))
+        height, contact, underside = map(_copied, (shown.height, shown.contact, shown.underside))
+        poses, touching = _copied(state.objects.poses), _copied(state.objects.touching)
+        poses[:, :, 2, 3] -= np.nan_to_num(clearance)[:, None]
+        for values in (vertices, forces, poses):
+            values[lost] = np.nan
         self._warn(residual)
-        deformed = DeformedCoat(self.mesh.coat, coat)
-        surface = GelSurface(self.grid, height, touched, centre, _touched_pose(state, poses), deformed)
-        return SoftReading(surface, vertices, forces, clearance, poses, undersides, residual, failed)
+        pose = None
+        if poses.shape[1]:
+            first = np.where(touching.any(axis=1), touching.argmax(axis=1), 0)
+            pose = poses[np.arange(len(poses)), first]
+        surface = GelSurface(self.grid, height, contact.view(bool), centre, pose, DeformedCoat(self.mesh.coat, coat))
+        each = tuple(poses[:, k].copy() for k in range(poses.shape[1]))
+        return SoftReading(surface, vertices, forces, clearance, each, underside, residual, lost)
 
-    def _upwards(self, state: CoatState, b: int) -> np.ndarray:
-        return state.vertices[b, :, 2] - self.mesh.coat.rest[:, 2]
-
-    def _bears(self, load: np.ndarray) -> np.ndarray:
-        """Mask (Ny, Nx) of the nodes in cells of which a vertex has a ``load`` (V,) [N]."""
-        mesh = self.mesh.coat
-        at_y, at_x = hat_matrix(mesh.lines_y, self.grid.y), hat_matrix(mesh.lines_x, self.grid.x)
-        return at_y @ load.reshape(mesh.shape) @ at_x.T > 0.0
-
-    def _correct(
-        self, state: CoatState, b: int, places: CoatPlaces, clearance: float, plain: np.ndarray, load: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-        """Height, contact mask, underside (Ny, Nx), coat vertices (V, 3) and residual of pad ``b``.
-
-        ``plain``: height without correction [m].
-        """
-        assert self.correction is not None
-        normal, sampler, tangential = self._stages
-        rest, upwards = self.mesh.coat.rest, self._upwards(state, b)
-        smooth = None
-        if len(state.objects) > 1:
-            smooth = self._fine_grid.rest + normal.sampler.lattice(self._surface.rise(places, upwards))
-        under_fine = self._underside(state, b, self._fine_grid, clearance, smooth)
-        contact = normal.solve(places, upwards, load, under_fine - self._fine_grid.rest)
-        under = under_fine if self._fine_grid is self.grid else self._underside(state, b, self.grid, clearance, plain)
-        if self.correction.normal:
-            height, touched = sampler.lay(self._rest + sampler.rise(contact), contact, under)
-        else:
-            height, touched = plain, sampler.touching(contact)
-        sideways = tangential.sideways(contact, state.vertices[b] - rest, load, state.friction(b))
-        coat = np.empty_like(rest)
-        coat[:, :2] = rest[:, :2] + sideways
-        coat[:, 2] = self._height_at(height, coat[:, :2])
-        return height, touched, under, coat, contact.residual
-
-    def _measure(self, state: CoatState, b: int) -> tuple[CoatPlaces, float]:
-        """Material points of one coat under the lattice, and the clearance [m]."""
-        forces, displacement = state.forces[b], state.vertices[b] - self.mesh.coat.rest
-        places = self._surface.places(displacement)
-        if not (forces[:, 2] < 0.0).any():
-            return places, float("nan")
-        below = float(self.grid.rest.max()) + 10.0 * self.mesh.d_hat
-        under = state.underside(b, self._clearance.x, self._clearance.y, below, below)
-        if len(state.objects) > 1:
-            smooth = self._clearance.heights(self._surface.rise(places, displacement[:, 2]))
-            under[under < smooth - _BEHIND] = np.inf
-        return places, self._clearance.measure(places, displacement[:, 2], -forces[:, 2] / self.mesh.coat.vertex_areas, under)
-
-    def _height_at(self, height: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """z of a ``height`` field (Ny, Nx) [m] at places (V, 2), extended beyond the pad's edge."""
-        x, y = (np.clip(place[:, k], line[0], line[-1]) for k, line in enumerate((self.grid.x, self.grid.y)))
-        return rest_height(self._gelpad, x, y) + sampled(height - self._rest, self.grid.x, self.grid.y, x, y)
+    def _batch(self, state: CoatState) -> _Batch:
+        """Arrays for as many environments as the state has, on its device."""
+        key = len(state.vertices), str(state.vertices.device)
+        if key not in self._batches:
+            self._batches[key] = _Batch(self, *key)
+        return self._batches[key]
 
     def _warn(self, residual: np.ndarray) -> None:
         """Warn once of a contact that was not solved."""
@@ -243,36 +157,173 @@ class SoftReader:
                 f"{1e6 * self.correction.unsolved:g} µm: the shown coat is laid on the object where it touches, and off by about so much "
                 "around it",
                 UnsolvedContactWarning,
-                stacklevel=2,
+                stacklevel=3,
             )
 
+    @property
+    def gelpad(self) -> GelpadSpec:
+        """Gelpad of the pads."""
+        return self._gelpad
+
     @cached_property
-    def _stages(self) -> tuple[NormalCorrection, ContactSampler, TangentialCorrection]:
-        """Stages of the correction, made at the first contact: the compliance takes a while."""
-        assert self.correction is not None
-        x, y = self._fine_grid.x, self._fine_grid.y
-        compliance = coat_compliance(self.mesh, self._gelpad)[0]
+    def fine_grid(self) -> PadGrid:
+        """Grid on which contact below the size of a cell is solved."""
+        correction = self.correction
+        if correction is None or min(self.grid.pitch) > 0.9 * correction.pitch:
+            return self.grid
+        return make_grid(self._gelpad, correction.pitch)
+
+    @cached_property
+    def compliances(self) -> tuple[np.ndarray, np.ndarray]:
+        """Compliance of the mesh, and if its sides may not move outwards; they take a while."""
         continued = coat_compliance(self.mesh, self._gelpad, rollers=True, along=(0, 1, 2))
-        normal = NormalCorrection(self._surface, self._gelpad, x, y, compliance[2], continued[2, 2], self.correction)
-        tangential = TangentialCorrection(normal, self._gelpad, compliance, continued)
-        return normal, ContactSampler(normal, self.grid.x, self.grid.y), tangential
-
-    def _underside(
-        self, state: CoatState, b: int, grid: PadGrid, clearance: float = 0.0, smooth: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Underside of the objects over a grid [m], (Ny, Nx), but for what is far below ``smooth``."""
-        under = state.underside(b, grid.x, grid.y, float(grid.rest.max()), lowered=clearance)
-        if len(state.objects) > 1 and smooth is not None:
-            under[under < smooth - _BEHIND] = np.inf
-        return under
+        return coat_compliance(self.mesh, self._gelpad)[0], continued
 
 
-def _touched_pose(state: CoatState, poses: tuple[np.ndarray, ...]) -> np.ndarray | None:
-    """Pose (B, 4, 4) of the first object that touches in each environment; None without objects."""
-    if not poses:
-        return None
-    result = poses[0].copy()
-    for thing, pose in reversed(list(zip(state.objects, poses, strict=True))):
-        touching = np.ones(len(pose), bool) if thing.touching is None else thing.touching
-        result[touching] = pose[touching]
-    return result
+def _copied(array: wp.array) -> np.ndarray:
+    return array.numpy().copy()
+
+
+class _Batch:
+    """Arrays and kernels of a reader for B pads of one device.
+
+    Attributes:
+        given: environments that are not to be read, (B,), bool.
+    """
+
+    def __init__(self, reader: SoftReader, num_envs: int, device: str) -> None:
+        mesh, grid, gelpad = reader.mesh, reader.grid, reader.gelpad
+        self._reader, self._products = reader, Products(num_envs, device)
+        products, self._device = self._products, wp.get_device(device)
+        self._surface = CoatSurface(mesh.coat, gelpad, products)
+        samples = make_grid(gelpad, max(_SAMPLE, *grid.pitch))
+        self._clearance = BarrierClearance(self._surface, samples, mesh.d_hat, products)
+        self._rows, self._columns = self._surface.matrices(grid.x, grid.y)
+        self._lattice, self._spare = (
+            products.zeros(*self._surface.lattice),
+            products.zeros(grid.shape[0], self._surface.lattice[1]),
+        )
+        self._rise, self._undersides = (
+            products.zeros(*grid.shape),
+            Undersides(grid, float(grid.rest.max()), num_envs, self._device),
+        )
+        self._rest = self._on_device(grid.rest, wp.float64)
+        self._hats, self._lines = hat_arrays(mesh.coat, grid.x, grid.y, self._device), node_lines(grid.x, grid.y)
+        vertices = len(mesh.coat.rest)
+        self._sound, self._load = self._zeros(num_envs, dtype=wp.int32), self._zeros(num_envs, vertices, dtype=wp.float64)
+        self._solved, self._none = self._zeros(0, dtype=wp.float64), self._zeros(num_envs, dtype=wp.bool)
+        self._height, self._contact = (self._zeros(num_envs, *grid.shape, dtype=dtype) for dtype in (wp.float32, wp.uint8))
+        self._above = self._zeros(num_envs, *grid.shape, dtype=wp.float32)
+        self._coat, self._centre = self._zeros(num_envs, vertices, dtype=wp.vec3d), self._zeros(num_envs, dtype=wp.vec2d)
+        self.given = self._zeros(num_envs, dtype=wp.bool)
+        self._state: CoatState | None = None
+        self._recorded: Recorded | None = None
+        self._shown: Any = None
+        self._residual, self._failed = self._zeros(num_envs, dtype=wp.float64), self._zeros(num_envs, dtype=wp.bool)
+
+    def measure(self, state: CoatState) -> wp.array:
+        """Launch the clearance [m], (B,)."""
+        self._find_sound(state, self._none)
+        return self._measure(state)
+
+    def read(self, state: CoatState) -> PadArrays:
+        """Show a state but for the environments ``given`` as failed."""
+        if self._state is not state:
+            self._state, self._recorded = state, None
+            self._shown = self._launch_all(state)
+            return self._shown
+        if self._recorded is None:
+            self._recorded = Recorded(partial(self._launch_all, state), device=self._device)
+        self._recorded()
+        return self._shown
+
+    def _launch_all(self, state: CoatState) -> PadArrays:
+        """Launch all that is shown."""
+        correction, sound = self._reader.correction, self._sound
+        lines, under = self._height.shape[:2], self._undersides
+        self._find_sound(state, self.given)
+        clearance = self._measure(state)
+        self._surface.rise(self._lattice)
+        self._products.sandwich(self._rows, self._lattice, self._columns, self._spare, self._rise)
+        under.find(state.objects, sound, clearance)
+        under.remove_behind(state.objects, self._rise.numbers, clearance)
+        if correction is None:
+            self._launch(normal_kernels.loads, self._load.shape, [sound, state.forces, clearance, self._load])
+            fields = [self._load, clearance, self._rest, self._rise.numbers, under.under, self._height, self._contact]
+            columns, d_hat = self._reader.mesh.coat.shape[1], self._reader.mesh.d_hat
+            self._launch(kernels.show_plain, lines, [self._hats, columns, d_hat, *fields])
+            wp.copy(self._coat, state.vertices)
+        else:
+            self._correct(state, clearance, correction)
+        self._launch(kernels.find_centres, len(sound), [sound, clearance, state.forces, state.vertices, self._centre])
+        self._launch(kernels.lose_heights, lines, [self._height, sound])
+        self._launch(kernels.find_sound_surfaces, self._coat.shape, [self._coat, sound])
+        self._launch(kernels.hide_nodes, lines, [sound, self._height, self._contact, under.under])
+        hidden = [self._coat, clearance, self._centre, self._residual, self._failed]
+        self._launch(kernels.hide_coats, len(sound), [sound, self._solved, *hidden])
+        return PadArrays(
+            self._height, self._contact, self._centre, self._coat, clearance, self._residual, under.under, state.vertices,
+            state.forces, self._failed,
+        )  # fmt: skip
+
+    def _find_sound(self, state: CoatState, failed: wp.array) -> None:
+        objects = state.objects
+        arrays = [failed, state.vertices, state.forces, objects.poses, self._sound]
+        self._launch(kernels.find_sound, len(self._sound), arrays)
+        for vertices, _ in objects.surfaces:
+            self._launch(kernels.find_sound_surfaces, vertices.shape, [vertices, self._sound])
+
+    def _measure(self, state: CoatState) -> wp.array:
+        self._surface.place(state.vertices, self._sound)
+        self._clearance.measure(state.forces, state.objects, self._sound)
+        return self._clearance.clearance
+
+    def _correct(self, state: CoatState, clearance: wp.array, correction: Correction) -> None:
+        """Launch the correction of height, contact and coat."""
+        normal, sampler, tangential, fine = self._stages
+        rise, sound, lines = self._rise.numbers, self._sound, self._height.shape[:2]
+        under = self._undersides.under
+        if fine is not None:
+            finer, rows, columns, lattice, risen = fine
+            self._products.sandwich(rows, self._lattice, columns, lattice, risen)
+            finer.find(state.objects, sound, clearance)
+            finer.remove_behind(state.objects, risen.numbers, clearance)
+            under = finer.under
+        normal.solve(state.forces, clearance, sound, under)
+        self._solved = normal.search.best
+        self._products.sandwich(self._rows, normal.rise, self._columns, self._spare, self._other)
+        laid = [int(correction.normal), correction.closed_gap, clearance, *sampler.nearest, normal.pressure.numbers, self._rest]
+        fields = [rise, self._other.numbers, sampler.dent(normal).numbers, self._undersides.under, self._height, self._contact]
+        self._launch(normal_kernels.lay, lines, [*laid, *fields])
+        tangential.correct(state.objects)
+        self._launch(kernels.above_rest, lines, [self._height, self._rest, self._above])
+        placed = [clearance, tangential.displacement, self._lines, self._above, state.vertices, self._coat]
+        self._launch(kernels.place_coat, self._coat.shape, [self._surface.struct, *placed])
+
+    @cached_property
+    def _stages(self) -> tuple[NormalCorrection, ContactSampler, TangentialCorrection, Any]:
+        """Stages of the correction, and what the fine grid needs if it is not the grid itself."""
+        reader, products = self._reader, self._products
+        assert reader.correction is not None
+        grid, (compliance, continued) = reader.fine_grid, reader.compliances
+        normal = NormalCorrection(self._surface, reader.gelpad, grid, compliance[2], continued[2, 2], reader.correction, products)
+        tangential = TangentialCorrection(normal, reader.gelpad, compliance, continued)
+        fine = None
+        if grid is not reader.grid:
+            undersides = Undersides(grid, float(grid.rest.max()), products.num_envs, self._device)
+            lattice = products.zeros(grid.shape[0], self._surface.lattice[1])
+            fine = undersides, *self._surface.matrices(grid.x, grid.y), lattice, products.zeros(*grid.shape)
+        return normal, ContactSampler(normal, reader.grid.x, reader.grid.y), tangential, fine
+
+    @cached_property
+    def _other(self) -> Any:
+        return self._products.zeros(*self._reader.grid.shape)
+
+    def _on_device(self, values: np.ndarray, dtype: Any) -> wp.array:
+        return wp.array(values, dtype=dtype, device=self._device)
+
+    def _zeros(self, *shape: int, dtype: Any) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device=self._device)
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, device=self._device)

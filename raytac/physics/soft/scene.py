@@ -5,18 +5,22 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike
 
 import ipc
 from raytac.errors import InputError, OverlapError
 from raytac.gel.surface import PadGrid, chosen_envs, make_grid
 from raytac.physics.soft.bodies import SceneBody, ScenePad, SceneRegistry, pad_body
+from raytac.physics.soft.coat_state import CoatState, SceneCoat
 from raytac.physics.soft.mesh import pad_stiffness
-from raytac.physics.soft.reading import CoatState, ContactObject, SoftReader, SoftReading
+from raytac.physics.soft.reading import PadArrays, SoftReader, SoftReading
 from raytac.physics.soft.scene_state import Poses, SceneReport, SceneState
 from raytac.physics.soft.settings import SceneSettings
+from raytac.physics.soft.sleep import Sleep
 from raytac.physics.soft.substeps import Substeps
 from raytac.se3 import batch_of, inverse, nearest_rotation, quaternion, quaternions, rigid_poses
 
@@ -105,8 +109,9 @@ class SoftScene:
             self.world = ipc.World([*gels, *solids], self.settings, self.num_envs, device, mu, ignored)
             if settings is None:
                 self.world.set_gravity(self.gravity)
+            self._start_state = self.world.save()
             if self.num_envs > 1:
-                self._place(*self._start, np.ones(self.num_envs, bool))
+                self.world.restore(self._placed(*self._start, np.ones(self.num_envs, bool)))
         except ipc.OverlapError as error:
             raise OverlapError(f"bodies overlap where they start: {error}") from error
         except ipc.IpcError as error:
@@ -114,7 +119,13 @@ class SoftScene:
         self._start_state = self.world.save()
         self._now = Poses(self._start[0], self._registry.driven(self._start[1])).copy()
         self._substeps = Substeps(self.pads, self.bodies, self, accuracy.substeps)
+        self._sleep = Sleep(
+            self.pads, self.bodies, self._substeps, self.world, self.settings.velocity_tolerance * self.settings.dt
+        )
+        self._asleep = np.zeros(self.num_envs, bool)
+        self._energies = np.zeros(self.num_envs), np.zeros(self.num_envs)
         self._readers: dict[str, SoftReader] = {}
+        self._coats: dict[str, SceneCoat] = {}
         self._coat_numbers = {name: self._surface_numbers(pad) for name, pad in self.pads.items()}
         self._failed = np.zeros(self.num_envs, bool)
 
@@ -123,29 +134,40 @@ class SoftScene:
         """Environments that are frozen until they are reset, (B,), bool."""
         return self._failed.copy()
 
-    def is_small(self, world_from_pad: ArrayLike, driven: _Poses | None = None, dt: float | None = None) -> bool:
-        """True if ``step`` with the same arguments would take a single substep."""
-        part, refused = self._substeps.next_part(0, self._now, self._goal(world_from_pad, driven), dt or self.settings.dt)
-        return part == self._substeps.limits.most and not refused
+    def is_small(self, world_from_pad: ArrayLike, driven: _Poses | None = None, dt: ArrayLike | None = None) -> np.ndarray:
+        """Environments (B,) in which ``step`` with the same arguments is not divided, or has failed."""
+        done, goal = np.zeros(self.num_envs, int), self._goal(world_from_pad, driven)
+        part, _ = self._substeps.next_part(done, self._now, goal, self._lengths(dt))
+        return self._failed | (part == self._substeps.limits.most)
 
-    def step(self, world_from_pad: ArrayLike, driven: _Poses | None = None, dt: float | None = None) -> SceneReport:
-        """Advance by ``dt`` [s] (None: the scene's).
+    def step(
+        self,
+        world_from_pad: ArrayLike,
+        driven: _Poses | None = None,
+        dt: ArrayLike | None = None,
+        envs: ArrayLike | None = None,
+    ) -> SceneReport:
+        """Advance environments by ``dt`` [s], one or (B,); None: the scene's.
 
+        ``envs``: a mask (B,) or list of them, None for all; the others stay as they are.
         Cases move to ``world_from_pad``, (S, 4, 4) or (B, S, 4, 4), and driven bodies to the poses given; others stay.
 
-        Two bodies that are near may move at most ``SubstepLimits.step`` and ``turn`` against each other at a time. The step is then divided
-        into halves, quarters and so on, with interpolated poses. Far from everything a pad may move any distance at once.
+        Two bodies that are near, one of them soft, may move at most ``SubstepLimits.step`` and ``turn`` against each other at a time. The
+        step of that environment is then divided into halves, quarters and so on, with interpolated poses. Far from everything a pad may
+        move any distance at once. Environments at rest in which nothing soft can be touched sleep: they are not solved (``Sleep``).
 
         Raises:
             InputError: an unknown or free body, a bad pose, or a motion near another body that would take more than
                 ``SubstepLimits.most`` substeps (by default 6.4 mm or 128° in one step); nothing has moved then. Of several environments
                 only the one with that motion fails, with a ``RuntimeWarning``.
         """
-        start, goal, most = self._now, self._goal(world_from_pad, driven), self._substeps.limits.most
+        start, goal, most = self._now.copy(), self._goal(world_from_pad, driven), self._substeps.limits.most
+        chosen, length = np.isin(np.arange(self.num_envs), chosen_envs(envs, self.num_envs)), self._lengths(dt)
         before: SceneState | None = None
-        done, total = 0, None
-        while done < most:
-            part, refused = self._substeps.next_part(done, self._now, goal, dt or self.settings.dt)
+        total, self._asleep = self._carry(goal, length, chosen)
+        done = np.where(chosen & ~self._asleep, 0, most)
+        while True:
+            part, refused = self._substeps.next_part(done, self._now, goal, length)
             if refused and self.num_envs == 1:
                 if before is not None:
                     self.restore(before)
@@ -155,28 +177,72 @@ class SoftScene:
                     warnings.warn(f"failed: {self._substeps.refusal(b, pair, start, goal)}", RuntimeWarning, stacklevel=2)
                 self.fail(list(refused))
                 continue
-            if part < most and before is None:
+            if not part.any():
+                sound = ~self._failed
+                return replace(
+                    total, failed=~sound, converged=total.converged & sound, last_converged=total.last_converged & sound
+                )
+            if self.num_envs == 1 and part[0] < most and before is None:
                 before = self.save()
-            done += part
+            done = done + part
             poses = start.towards(goal, done / most)
-            report = self.advance(poses.pads, poses.bodies, (dt or self.settings.dt) * part / most)
-            total = report if total is None else total.then(report)
-        assert total is not None
-        return total
+            total = total.then(self.advance(poses.pads, poses.bodies, length * part / most, part > 0))
 
-    def advance(self, world_from_pad: np.ndarray, driven: Mapping[str, np.ndarray], dt: float | None = None) -> SceneReport:
-        """One undivided solver step to (B, S, 4, 4) and (B, 4, 4) by name; ``dt`` as for ``step``."""
+    def advance(
+        self,
+        world_from_pad: np.ndarray,
+        driven: Mapping[str, np.ndarray],
+        dt: ArrayLike | None = None,
+        envs: np.ndarray | None = None,
+    ) -> SceneReport:
+        """One undivided solver step to (B, S, 4, 4) and (B, 4, 4) by name; others as for ``step``."""
+        chosen = np.ones(self.num_envs, bool) if envs is None else envs
+        self._aim(world_from_pad, driven, chosen)
+        return self._report(self.world.step(self._lengths(dt), chosen), chosen & ~self._failed)
+
+    @property
+    def asleep(self) -> np.ndarray:
+        """Environments (B,) that slept through the last step: nothing touches their gels."""
+        return self._asleep.copy()
+
+    def _carry(self, goal: Poses, length: np.ndarray, chosen: np.ndarray) -> tuple[SceneReport, np.ndarray]:
+        """Let those of the environments (B,) that sleep go to ``goal``; a report without a solve."""
+        asleep = chosen & ~self._failed & self._sleep.choose(self._now, goal)
+        if asleep.any():
+            self._aim(goal.pads, goal.bodies, asleep)
+            self.world.carry(length, asleep)
+        return SceneReport.of_none(self._failed, *self._energies), asleep
+
+    def _aim(self, world_from_pad: np.ndarray, driven: Mapping[str, np.ndarray], chosen: np.ndarray) -> None:
+        """Set the targets of the environments (B,) that move next."""
         for k, name in enumerate(self.pads):
             self.world.set_target(name, world_from_pad[:, k, :3, 3], quaternions(world_from_pad[:, k]))
+            self._now.pads[chosen, k] = world_from_pad[chosen, k]
         for name, pose in driven.items():
             self.world.set_target(name, pose[:, :3, 3], quaternions(pose))
-        self._now = Poses(world_from_pad, self._now.bodies | dict(driven)).copy()
-        r = self.world.step(dt)
-        self._failed = r.failed
-        unconverged = (~r.converged & ~r.failed).astype(int)
+            self._now.bodies[name][chosen] = pose[chosen]
+
+    def _report(self, r: ipc.StepReport, stepped: np.ndarray) -> SceneReport:
+        """The solver's report, of the environments (B,) that it stepped."""
+        self._failed, self._energies = r.failed, (r.elastic, r.barrier)
         return SceneReport(
-            *(r.failed, r.converged, unconverged, r.converged, r.min_gap, r.min_det, r.blocked, r.newton, r.elastic, r.barrier, 1)
+            failed=r.failed,
+            converged=r.converged,
+            unconverged=(stepped & ~r.converged & ~r.failed).astype(int),
+            last_converged=r.converged,
+            min_gap=r.min_gap,
+            min_det=np.where(stepped, r.min_det, 1.0),
+            blocked=r.blocked,
+            newton=r.newton,
+            linear=r.linear,
+            elastic=r.elastic,
+            barrier=r.barrier,
+            substeps=stepped.astype(int),
         )
+
+    def _lengths(self, dt: ArrayLike | None) -> np.ndarray:
+        """Length of the step of every environment [s], (B,)."""
+        return np.broadcast_to(np.asarray(self.settings.dt if dt is None else dt, float), self.num_envs)
 
     def wrench(self, pad: str) -> np.ndarray:
         """Contact force on a pad and torque about its origin, world axes, [N], [N m], (B, 6).
@@ -257,25 +323,38 @@ class SoftScene:
 
     def reading(self, pad: str, grid: PadGrid | None = None, failed: np.ndarray | None = None) -> SoftReading:
         """Surface, contact, forces of a pad on its own grid or another; NaN where ``failed`` (B,)."""
+        reader, lost = self._reader(pad, grid), self._failed if failed is None else self._failed | failed
+        return reader.read(self.coat_state(pad), lost)
+
+    def arrays(self, pad: str, grid: PadGrid | None = None, failed: np.ndarray | None = None) -> PadArrays:
+        """As ``reading``, but arrays of the device that the next reading overwrites: no copies."""
+        lost = self._failed if failed is None else self._failed | failed
+        given = wp.array(lost, dtype=wp.bool, device=self.world.device)
+        return self._reader(pad, grid).launch(self.coat_state(pad), given)
+
+    def _reader(self, pad: str, grid: PadGrid | None) -> SoftReader:
         scene_pad = self._registry.pad(pad)
         if pad not in self._readers or (grid is not None and grid is not self._readers[pad].grid):
             mesh = replace(scene_pad.mesh, d_hat=self.world.d_hat)
             self._readers[pad] = SoftReader(mesh, scene_pad.sensor.gelpad, grid or self.grid(pad), scene_pad.correction)
-        return self._readers[pad].read(self.coat_state(pad), self._failed if failed is None else self._failed | failed)
+        return self._readers[pad]
 
     def coat_state(self, pad: str) -> CoatState:
-        """A pad's coat with the forces on it, and the objects that it touches."""
-        frame = inverse(self.pose(self._registry.pad(pad).name))
-        objects = []
-        for name, touching in self.world.touching(pad).items():
-            body = self.bodies.get(name)
-            if body is not None and not body.is_soft:
-                # As in the solver, the last coefficient of a pair counts if it was given in both orders.
-                mu = [mu for pair, mu in self._friction.items() if set(pair) == {pad, name}][-1]
-                objects.append(ContactObject(body.parts, frame @ self.pose(name), None, touching, mu))
-            elif name != pad:
-                objects.append(ContactObject((), frame @ self.pose(name), self.skin(name, pad), touching))
-        return CoatState(self.coat(pad), self.coat_forces(pad), tuple(objects))
+        """A pad's coat with the forces on it, and the objects that it touches, on the device.
+
+        The next call overwrites it.
+        """
+        if pad not in self._coats:
+            others = [other for name, other in self.pads.items() if name != pad]
+            # As in the solver, the last coefficient of a pair counts if it was given in both orders.
+            friction = {name: mu for pair, mu in self._friction.items() if pad in pair for name in pair if name != pad}
+            self._coats[pad] = SceneCoat(self.world, self._registry.pad(pad), others, self.bodies, friction)
+        coat = self._coats[pad]
+        state = coat.read()
+        for name, k in coat.free.items():  # the rotation that fits a soft body best comes from the host
+            column: Any = state.objects.poses[:, k]
+            column.assign(inverse(self.pose(pad)) @ self.pose(name))
+        return state
 
     def save(self) -> SceneState:
         """The state of every environment."""
@@ -305,14 +384,11 @@ class SoftScene:
         if world_from_pad is not None:
             pads = rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(self.pads))
         bodies = self._start[1] | self._registry.named(world_from_body or {}, free=True)
-        before = self.save()
+        placed = SceneState(self._placed(pads, bodies, mask), Poses(pads, self._registry.driven(bodies)))
         try:
-            self.world.restore(self._start_state, mask)
-            self._place(pads, bodies, mask)
+            self.restore(placed, mask)
         except ipc.OverlapError as error:
-            self.world.restore(before.world, mask)
             raise OverlapError(f"bodies overlap at the poses of the reset: {error}") from error
-        self.restore(SceneState(self.world.save(), Poses(pads, self._registry.driven(bodies))), mask)
 
     def fail(self, envs: ArrayLike) -> None:
         """Freeze environments, a mask (B,) or a list, until they are reset."""
@@ -344,9 +420,12 @@ class SoftScene:
         pads = rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(self.pads))
         return Poses(pads, self._now.bodies | self._registry.named(driven or {}))
 
-    def _place(self, pads: np.ndarray, bodies: Mapping[str, np.ndarray], mask: np.ndarray) -> None:
-        """Set the poses of the environments of the mask, undeformed and at rest."""
-        state, layout = self.world.save(), self.world.layout
+    def _placed(self, pads: np.ndarray, bodies: Mapping[str, np.ndarray], mask: np.ndarray) -> ipc.State:
+        """The present state, but for the environments of the mask: undeformed and at rest at these poses."""
+        state, start, layout = self.world.save(), self._start_state, self.world.layout
+        for name in ("y", "velocity", "frame_rotation", "frame_position", "kappa", "failed"):
+            getattr(state, name)[mask] = getattr(start, name)[mask]
+        state.stuck[mask] = -1
         poses = {name: pads[:, k] for k, name in enumerate(self.pads)} | dict(bodies)
         for name, pose in poses.items():
             body = self.bodies.get(name)
@@ -359,7 +438,7 @@ class SoftScene:
             change = pose @ inverse(self._start[1][name][:1])
             nodes_now = np.einsum("bij,nj->bni", change[:, :3, :3], layout.node_rest[nodes]) + change[:, None, :3, 3]
             state.y[mask, nodes] = nodes_now[mask]
-        self.world.restore(state, mask)
+        return state
 
     @staticmethod
     def _at_start(solid, pose: np.ndarray):

@@ -22,8 +22,8 @@ class Poses:
     def copy(self) -> Poses:
         return Poses(self.pads.copy(), {name: pose.copy() for name, pose in self.bodies.items()})
 
-    def towards(self, goal: Poses, share: float) -> Poses:
-        """Interpolation at a ``share`` of the motion to ``goal``."""
+    def towards(self, goal: Poses, share: np.ndarray) -> Poses:
+        """Interpolation at shares (B,) of the motion to ``goal``."""
         pads = [between(self.pads[:, k], goal.pads[:, k], share) for k in range(self.pads.shape[1])]
         return Poses(np.stack(pads, axis=1), {name: between(self.bodies[name], p, share) for name, p in goal.bodies.items()})
 
@@ -41,8 +41,8 @@ class SceneReport:
     failed: a number was not finite; the environment stays as it was until it is reset. converged: every substep met its tolerance.
     unconverged: number of substeps that did not, in an environment that has not failed. last_converged: the last substep did.
     min_gap: least distance between surfaces [m], inf if none was near. min_det: least det F of any tetrahedron [-]. blocked: largest share
-    of a substep's motion that was refused because it would crush an obstacle. newton: iterations. elastic, barrier: energies at the
-    end [J]. substeps: number of them.
+    of a substep's motion that was refused because it would crush an obstacle. newton: iterations, and linear: those of their conjugate
+    gradients. elastic, barrier: energies at the end [J]. substeps: how often the solver was called, 0 where an environment is asleep.
     """
 
     failed: np.ndarray
@@ -53,9 +53,29 @@ class SceneReport:
     min_det: np.ndarray
     blocked: np.ndarray
     newton: np.ndarray
+    linear: np.ndarray
     elastic: np.ndarray
     barrier: np.ndarray
-    substeps: int
+    substeps: np.ndarray
+
+    @classmethod
+    def of_none(cls, failed: np.ndarray, elastic: np.ndarray, barrier: np.ndarray) -> SceneReport:
+        """Report of no substep, after which the state has these energies (B,) [J]."""
+        none = np.zeros(len(failed), int)
+        return cls(
+            failed=failed.copy(),
+            converged=~failed,
+            unconverged=none,
+            last_converged=~failed,
+            min_gap=none + np.inf,
+            min_det=none + 1.0,
+            blocked=none + 0.0,
+            newton=none,
+            linear=none,
+            elastic=elastic,
+            barrier=barrier,
+            substeps=none,
+        )
 
     def then(self, later: SceneReport) -> SceneReport:
         """This and a later part of the step as one."""
@@ -63,11 +83,13 @@ class SceneReport:
             later,
             failed=self.failed | later.failed,
             converged=self.converged & later.converged,
+            last_converged=np.where(later.substeps > 0, later.last_converged, self.last_converged),
             unconverged=self.unconverged + later.unconverged,
             min_gap=np.minimum(self.min_gap, later.min_gap),
             min_det=np.minimum(self.min_det, later.min_det),
             blocked=np.maximum(self.blocked, later.blocked),
             newton=self.newton + later.newton,
+            linear=self.linear + later.linear,
             substeps=self.substeps + later.substeps,
         )
 

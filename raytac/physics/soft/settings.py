@@ -38,8 +38,8 @@ class Correction(_Settings):
     """Correct how far pressure spreads the skin sideways (``TangentialCorrection``)."""
     friction: bool = True
     """Correct how far the skin follows a sheared or twisted object (``FrictionCorrection``)."""
-    pitch: float = 0.1e-3
-    """Spacing of the fine grid [m]; the surface's own grid if that is above 0.9 times this."""
+    pitch: float = 0.05e-3
+    """Least spacing of the fine grid [m]; the surface's own grid if above 0.9 times this."""
     gap_tolerance: float = 1e-6
     """Deepest overlap and widest gap under pressure of a solved contact [m]."""
     normal_iterations: int = 40

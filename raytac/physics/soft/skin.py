@@ -44,6 +44,11 @@ class SoftSkin:
         """Points at rest [m], (P, 3), and their triangles."""
         self._vertex, self._weight = _weights(self.rest, tets.vertices)
 
+    @property
+    def weights(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices on which each point depends, and their weights, (P, K) each."""
+        return self._vertex, self._weight
+
     def deform(self, vertices: np.ndarray) -> np.ndarray:
         """The skin [m], (B, P, 3), for vertices of the tetrahedra at (B, n, 3), in their frame."""
         skin = np.zeros((len(vertices), *self.rest.shape))

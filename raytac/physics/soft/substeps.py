@@ -1,4 +1,9 @@
-"""Substeps of a soft scene: division of a step where bodies are near each other."""
+"""Substeps of a soft scene: division of a step where something soft is near another body.
+
+Every environment divides its own step, as it would alone. What a rigid body does by itself near another rigid one does not divide
+it: where it slides, rolls or falls on a table it moves as far in one step as its speed takes it, and the solver's collision detection
+keeps it outside.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +39,12 @@ class SceneQuery(Protocol):
 
 
 class Substeps:
-    """Divides steps into halves, quarters and so on, so that near bodies move little in each."""
+    """Divides steps into halves, quarters and so on, so that bodies near a soft one move little.
+
+    Attributes:
+        pairs: names of bodies of which one is soft.
+        rigid_pairs: a driven and a free rigid body, of which the motion of the driven one counts. In both a half-space comes second.
+    """
 
     def __init__(
         self, pads: Mapping[str, ScenePad], bodies: Mapping[str, SceneBody], query: SceneQuery, limits: SubstepLimits
@@ -42,27 +52,31 @@ class Substeps:
         self.limits = limits
         self._pads, self._bodies, self._query = pads, bodies, query
         self.pairs: list[Pair] = [*combinations(pads, 2), *product(pads, bodies)]
-        for a, b in combinations(bodies.values(), 2):  # two free bodies are left to the solver; a half-space comes second
+        self.rigid_pairs: list[Pair] = []
+        for a, b in combinations(bodies.values(), 2):  # two free bodies are left to the solver
             if a.is_driven != b.is_driven:
-                self.pairs.append((b.name, a.name) if isinstance(a.solid, ipc.HalfSpace) else (a.name, b.name))
+                pair = (b.name, a.name) if isinstance(a.solid, ipc.HalfSpace) else (a.name, b.name)
+                (self.pairs if a.is_soft or b.is_soft else self.rigid_pairs).append(pair)
 
-    def next_part(self, done: int, now: Poses, goal: Poses, dt: float) -> tuple[int, dict[int, Pair | None]]:
-        """Part of a step of ``dt`` [s] that may be made next, and the environments to refuse.
+    def next_part(self, done: np.ndarray, now: Poses, goal: Poses, dt: np.ndarray) -> tuple[np.ndarray, dict[int, Pair | None]]:
+        """Parts (B,) of a step of ``dt`` (B,) [s] that may be made next, and whom to refuse.
 
-        With the pair that moves too far. Parts are counted in ``limits.most``-ths of the step; the result is a power of two that
-        divides ``done``. Refused environments do not limit it. Free bodies are never refused (a beam may snap back): the solver
-        resolves them, in the smallest parts.
+        The environments to refuse come with the pair that moves too far. Parts are counted in ``limits.most``-ths of the step, as is
+        ``done`` (B,). They are powers of two that divide ``done``; 0 where the step is done, or failed. Free bodies are never refused (a
+        beam may snap back): the solver resolves them, in the smallest parts.
         """
-        most = self.limits.most
-        room, pairs = self._room(done, self._motions(now, goal, dt * (1.0 - done / most)))
-        if (room < 1.0).any():
-            driven = self._room(done, self._motions(now, goal, 0.0))[0]
-            room = np.where((room < 1.0) & (driven >= 1.0), 1.0, room)
-        least = room[room >= 1.0].min(initial=most)
-        part = most
-        while part > least or done % part:
-            part //= 2
-        return part, {b: pairs[b] for b in np.flatnonzero(room < 1.0).tolist()}
+        most, waits = self.limits.most, (done < self.limits.most) & ~self._query.failed
+        motions = self.motions(now, goal, dt * (1.0 - done / most))
+        driven = {
+            name: motion if self._is_driven(name) else replace(motion, end=motion.start) for name, motion in motions.items()
+        }
+        room, pairs = self._room(done, motions, driven)
+        if (waits & (room < 1.0)).any():
+            room = np.where((room < 1.0) & (self._room(done, driven, driven)[0] >= 1.0), 1.0, room)
+        refused = waits & (room < 1.0)
+        part = 2 ** np.floor(np.log2(np.clip(room, 1.0, most))).astype(int)
+        part = np.where(done > 0, np.minimum(part, done & -done), part)
+        return np.where(waits & ~refused, part, 0), {b: pairs[b] for b in np.flatnonzero(refused).tolist()}
 
     def refusal(self, b: int, pair: Pair | None, now: Poses, goal: Poses) -> InputError:
         """The error of a motion of environment ``b`` that cannot be resolved."""
@@ -74,14 +88,26 @@ class Substeps:
         )
         return InputError("world_from_pad", value=f"displacements of up to {now.longest(goal, b) * 1e3:.3g} mm", rule=rule)
 
-    def _room(self, done: int, motions: Mapping[str, BoxMotion]) -> tuple[np.ndarray, list[Pair | None]]:
-        """Parts of the step that these motions allow, (B,), and the pairs that limit it."""
-        pairs = [(a, b) for a, b in self.pairs if not (motions[a].is_still() and motions[b].is_still())]
-        share, limiting = allowed_share(motions, pairs, self.limits.reach * self._query.world.d_hat, self.limits)
+    def _is_driven(self, name: str) -> bool:
+        return name in self._pads or self._bodies[name].is_driven
+
+    def _room(
+        self, done: np.ndarray, motions: Mapping[str, BoxMotion], driven: Mapping[str, BoxMotion]
+    ) -> tuple[np.ndarray, list[Pair | None]]:
+        """Parts of the step that motions allow, (B,), and the pairs that limit it.
+
+        ``driven``: motions of driven bodies alone, that count between rigid bodies.
+        """
+        share, limiting = np.ones(len(done)), [None] * len(done)
+        for chosen, moving in ((self.pairs, motions), (self.rigid_pairs, driven)):
+            pairs = [(a, b) for a, b in chosen if not (moving[a].is_still() and moving[b].is_still())]
+            least, by = allowed_share(moving, pairs, self.limits.reach * self._query.world.d_hat, self.limits)
+            limiting = [new if lower else old for new, old, lower in zip(by, limiting, least < share, strict=True)]
+            share = np.minimum(share, least)
         return (self.limits.most - done) * share * (1.0 + 1e-9), limiting
 
-    def _motions(self, now: Poses, goal: Poses, remaining: float) -> dict[str, BoxMotion]:
-        """Motions of pads and bodies to ``goal``; free ones keep their velocity, ``remaining`` [s]."""
+    def motions(self, now: Poses, goal: Poses, remaining: np.ndarray) -> dict[str, BoxMotion]:
+        """Motions to ``goal``; free bodies keep their velocity for ``remaining`` (B,) [s]."""
         motions = {}
         for k, (name, pad) in enumerate(self._pads.items()):
             rest, vertices = pad.mesh.tets.vertices, self._query.world.positions(name, frame="body")
@@ -95,7 +121,7 @@ class Substeps:
         return motions
 
     def _body_motion(
-        self, body: SceneBody, now: Mapping[str, np.ndarray], goal: Mapping[str, np.ndarray], remaining: float
+        self, body: SceneBody, now: Mapping[str, np.ndarray], goal: Mapping[str, np.ndarray], remaining: np.ndarray
     ) -> BoxMotion:
         name, solid, ones = body.name, body.solid, np.ones((len(self._query.failed), 1))
         if isinstance(solid, ipc.HalfSpace):
@@ -108,12 +134,12 @@ class Substeps:
             low, high = (ones * corner for corner in (solid.surface.vertices.min(axis=0), solid.surface.vertices.max(axis=0)))
         if not body.is_driven:  # it keeps its momentum
             motion = self._query.world.rigid_motion(name)
-            end = _move(start, motion.centre, remaining * motion.velocity, remaining * motion.spin)
+            end = _move(start, motion.centre, remaining[:, None] * motion.velocity, remaining[:, None] * motion.spin)
         else:
             end = self._contact_end(solid, start, goal[name], remaining) if isinstance(solid, ipc.SoftBody) else goal[name]
         return BoxMotion(start, end, low, high)
 
-    def _contact_end(self, solid: ipc.SoftBody, start: np.ndarray, goal: np.ndarray, remaining: float) -> np.ndarray:
+    def _contact_end(self, solid: ipc.SoftBody, start: np.ndarray, goal: np.ndarray, remaining: np.ndarray) -> np.ndarray:
         """Pose of a driven soft body whose contact keeps its velocity; ``goal`` without contact."""
         world = self._query.world
         load = np.linalg.norm(world.contact_forces(solid.name), axis=2)
@@ -129,7 +155,9 @@ class Substeps:
         inertia = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
         momentum = np.einsum("bn,bni->bi", weight, np.cross(arm, v - velocity[:, None]))
         spin = np.linalg.solve(inertia, momentum[..., None])[..., 0]
-        return np.where(touched[:, None, None], _move(start, centre, remaining * velocity, remaining * spin), goal)
+        return np.where(
+            touched[:, None, None], _move(start, centre, remaining[:, None] * velocity, remaining[:, None] * spin), goal
+        )
 
 
 @dataclass(frozen=True)
@@ -177,6 +205,15 @@ def allowed_share(
         for env in np.flatnonzero(share < least).tolist():
             least[env], limiting[env] = share[env], pair
     return least, limiting
+
+
+def clear_of_each_other(a: BoxMotion, b: BoxMotion, distance: float) -> np.ndarray:
+    """Environments (B,) in which two boxes keep a ``distance`` [m] all along their motions.
+
+    One normal of a face separates them by it at the start and at the end, and so in between. ``a`` must not be a half-space.
+    """
+    gaps = (_plane_gaps(a, b) if b.is_plane else _box_gaps(a, b))[0]
+    return gaps.min(axis=0).max(axis=1) > distance
 
 
 def _plane_gaps(a: BoxMotion, plane: BoxMotion) -> tuple[np.ndarray, ...]:

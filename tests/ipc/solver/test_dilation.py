@@ -188,7 +188,7 @@ def test_the_product_and_the_diagonal_hold_the_blocks(rng: np.random.Generator) 
     solver.launch(multiply_blocks, (1, 1, 1), [solver.system, solver.p, solver.everyone, 1], [out, partial])
     assert out.numpy()[0].ravel() == pytest.approx(H @ p.ravel(), abs=1e-12 * np.abs(H @ p.ravel()).max())
     assert partial.numpy()[0, 0] == pytest.approx(p.ravel() @ H @ p.ravel(), rel=1e-12)
-    jacobi = pcg.BlockJacobi(1, len(y), 1, wp.get_device("cpu"))
+    jacobi = pcg.BlockJacobi(solver.layout, 1, 1, wp.get_device("cpu"))
     jacobi.update(solver.system, solver.collision.contacts, 0, solver.everyone)
     for i in (0, 13, 26):
         inverse = np.linalg.inv(H[3 * i : 3 * i + 3, 3 * i : 3 * i + 3])

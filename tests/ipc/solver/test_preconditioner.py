@@ -12,8 +12,9 @@ import warp as wp
 import ipc
 from ipc.bodies import Layout, build_layout, rotation_matrix
 from ipc.contact.contacts import Contacts, mat34d
+from ipc.solver.block_jacobi import BlockJacobi
 from ipc.solver.frames import VertexMap
-from ipc.solver.linear import BlockJacobi, SystemView
+from ipc.solver.linear import SystemView
 from ipc.solver.preconditioners import pays
 from ipc.solver.preconditioners.rest_inverse import RestInverse
 from ipc.solver.preconditioners.rest_stiffness import rest_blocks
@@ -141,7 +142,7 @@ class Recorder(BlockJacobi):
 def test_rest_blocks_are_those_of_the_solver(model: str) -> None:
     pad = bonded_pad(small_pad((3, 3, 2)), material=ipc.Material(1e5, 0.45, 1000.0, model=model, mass_damping=3.0))  # pyright: ignore[reportArgumentType]
     world = ipc.World([pad], ipc.Settings(gravity=(0, 0, -1.0)), device="cpu")
-    recorder = Recorder(1, len(world.layout.node_rest), 1, world.device)
+    recorder = Recorder(world.layout, 1, 1, world.device)
     world._newton.preconditioner = recorder
     world.step()
     assert recorder.blocks is not None

@@ -10,10 +10,11 @@ from raytac.errors import InputError
 from raytac.gel.coat_mesh import CoatMesh, DeformedCoat
 from raytac.gel.interpolate import SplineAxis, hat_matrix
 from raytac.gel.surface import make_grid, rest_height
-from raytac.gel.traction import CoatTraction, cell_areas, foundation_traction
-from raytac.physics.soft.coat_surface import BarrierClearance, CoatSurface
+from raytac.gel.traction import cell_areas, foundation_traction
+from raytac.physics.soft.coat_points import CoatTraction
 from raytac.physics.soft.mesh import pad_mesh
 from raytac.specs import load_sensor
+from tests.physics.soft.oracles.coat_surface import BarrierClearance, CoatSurface
 
 GELPAD = load_sensor("gelsight_mini").gelpad
 LINES = np.array([0.0, 0.3, 1.1, 1.5, 2.9, 3.0])

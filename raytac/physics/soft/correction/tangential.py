@@ -1,297 +1,149 @@
-"""Correction of the sideways displacement of the coat's vertices, by pressure and friction."""
+"""Correction of the sideways displacement of the coat's vertices by pressure, for B pads."""
+
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportAttributeAccessIssue=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import warp as wp
 
-from raytac.gel.components import span
-from raytac.gel.interpolate import sampled
-from raytac.gel.matmul import product, sandwich
-from raytac.physics.bonded_layer import layer_compliance, layer_shear, layer_spread
-from raytac.physics.soft.correction.cosine_series import CosineSeries
-from raytac.physics.soft.correction.normal import NormalContact, NormalCorrection
+from raytac.physics.bonded_layer import layer_spread
+from raytac.physics.soft.correction import force_kernels
+from raytac.physics.soft.correction.friction import FrictionCorrection
+from raytac.physics.soft.correction.normal import NormalCorrection
+from raytac.physics.soft.correction.plane_kernels import Lines, Moments, displaced, fit, moments, sampled
+from raytac.physics.soft.correction.plane_waves import PlaneField, PlaneWaves, node_lines
+from raytac.physics.soft.undersides import Touched
 from raytac.specs.sensor import GelpadSpec
 
-Response = Callable[[np.ndarray], np.ndarray]
-"""A: displacement [m] of a traction [Pa], (2, n, m) each."""
+wp.set_module_options({"enable_backward": False, "fast_math": False})
+
+_0 = wp.constant(wp.float64(0.0))
+_1 = wp.constant(wp.float64(1.0))
 
 
-@dataclass(frozen=True)
-class PlaneMotion:
-    """Rigid motion in the plane, of less than a quarter turn."""
-
-    centre: np.ndarray
-    """[m], (2,)."""
-    shift: np.ndarray
-    """Displacement of the centre [m], (2,)."""
-    sine: float
-    """Sine of the rotation about +z."""
-
-    @staticmethod
-    def fit(displacement: np.ndarray, place: np.ndarray, weight: np.ndarray) -> PlaneMotion:
-        """The motion nearest to a ``displacement`` (n, 2) of ``place`` (n, 2) [m], by ``weight``."""
-        share = weight / weight.sum()
-        centre, shift = share @ place, share @ displacement
-        arm = place - centre
-        size = float(share @ (arm**2).sum(axis=1))
-        moment = float(share @ (arm[:, 0] * displacement[:, 1] - arm[:, 1] * displacement[:, 0]))
-        return PlaneMotion(centre, shift, moment / size if size > 0.0 else 0.0)
-
-    def at(self, place: np.ndarray) -> np.ndarray:
-        """Displacement [m] of places (…, 2) [m], same shape."""
-        arm = place - self.centre
-        shorter = np.sqrt(max(1.0 - self.sine**2, 0.0)) - 1.0
-        return self.shift + self.sine * np.stack([-arm[..., 1], arm[..., 0]], axis=-1) + shorter * arm
-
-    def plus(self, goal: PlaneMotion, mean: PlaneMotion) -> PlaneMotion:
-        """This motion plus the difference of ``goal`` and ``mean``, taken at this one's centre."""
-        difference = goal.at(self.centre) - mean.at(self.centre)
-        return PlaneMotion(self.centre, self.shift + difference, self.sine + goal.sine - mean.sine)
+@wp.func
+def vector(values: wp.array2d(dtype=wp.float64), env: wp.int32, v: wp.int32, vertices: wp.int32) -> wp.vec2d:
+    """Entries of a vertex in numbers along x and then y, (B, 2 V)."""
+    return wp.vec2d(values[env, v], values[env, vertices + v])
 
 
-@dataclass(frozen=True)
-class TangentialContact:
-    """Stick and slip of one contact on a window of the tangential grid."""
-
-    place: np.ndarray
-    """Rest position of the window's nodes [m], (n, m, 2)."""
-    traction: np.ndarray
-    """τ of the object on the skin [Pa], (2, n, m)."""
-    bound: np.ndarray
-    """Coulomb's limit μ p [Pa], (n, m)."""
-    displacement: np.ndarray
-    """A τ [m], (2, n, m)."""
-    waves: np.ndarray
-    """Amplitudes of A τ over the whole pad [m], (2, Ky, Kx)."""
+@wp.func
+def moved(values: wp.array3d(dtype=wp.float64), env: wp.int32, v: wp.int32) -> wp.vec2d:
+    return wp.vec2d(values[env, 0, v], values[env, 1, v])
 
 
-Lines = tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]
-"""Cosines and sines over lines, (Kx, Nx) each, and (Ny, Ky) each."""
+@wp.kernel
+def find_shares(
+    touched: wp.array(dtype=wp.int32), touching: wp.array2d(dtype=wp.int32), rest: wp.array(dtype=wp.vec3d),
+    displacement: wp.array3d(dtype=wp.float64), pattern: wp.array2d(dtype=wp.float64),
+    # outputs
+    share: wp.array(dtype=wp.float64),
+):  # fmt: skip
+    """Share in [0, 1] of a ``pattern`` (B, 2 V) in the displacement of what touches.
 
-
-def plane_waves(along_x: CosineSeries, along_y: CosineSeries, x: np.ndarray, y: np.ndarray) -> Lines:
-    """Waves of both series over lines ``x`` (Nx,), ``y`` (Ny,) [m], for ``plane_displacement``."""
-    over_x = tuple(np.ascontiguousarray(f(x).T, np.float32) for f in (along_x.synthesis, along_x.sines))
-    return over_x, tuple(f(y).astype(np.float32) for f in (along_y.synthesis, along_y.sines))
-
-
-def plane_displacement(waves: np.ndarray, lines: Lines) -> np.ndarray:
-    """Displacement along x and y [m], (2, Ny, Nx), of amplitudes (2, Ky, Kx) of plane waves."""
-    (cos_x, sin_x), (cos_y, sin_y) = lines
-    return np.stack([sandwich(cos_y, waves[0], sin_x), sandwich(sin_y, waves[1], cos_x)])
-
-
-class FrictionCorrection:
-    """Exchanges the mesh's response to friction for the layer's (*defect correction*).
-
-    Let v be the sideways displacement that friction has given to the vertices in contact. E q is what *the same mesh* does, by linear
-    elasticity, under tangential forces q on these vertices that hold them at v. A τ is what *the gel layer* does under a traction τ on
-    a fine grid. The skin's displacement u becomes
-
-        u − E q + A τ,   A τ = D where the contact sticks,   |τ| ≤ μ p everywhere, with τ along the slip at the limit,
-
-    with the pressure p of ``NormalContact``. So the contact's edge slips as in C. Cattaneo (1938) and R. D. Mindlin (J. Appl. Mech. 16,
-    1949): one coefficient for the whole contact, one loading, no history. D is a rigid motion. It makes the mean of A τ over the contact
-    (shift and rotation, weighted by p) equal to that of v weighted by the mesh's normal forces, since that mean hardly depends on the
-    mesh. Where everything slides and the mean is still too small, μ p is raised in proportion: small strain underestimates the pressure.
-    Where the contact does not move as such a one would (a bar that ploughs its ends through the gel as it turns), the correction is
-    blended out.
-
-    A is the layer's compliance wave by wave, as if the pad were continued by its mirror image, and E is of a mesh with such sides.
-    Both drag the gel by nearly the same force, so the effect of the true sides stays in u.
+    Rigid motions are taken out of both.
     """
+    env = wp.tid()
+    share[env] = _0
+    if touched[env] == 0:
+        return
+    vertices, total = len(rest), Moments()
+    for v in range(vertices):
+        if touching[env, v] != 0:
+            total += moments(_1, wp.vec2d(rest[v][0], rest[v][1]), moved(displacement, env, v))
+    count = total[0]
+    if not (count > _0):
+        share[env] = _1
+        return
+    motion, middle = fit(total), wp.vec2d(total[1] / count, total[2] / count)
+    mean_u, mean_p, size, turn_u, turn_p = wp.vec2d(), wp.vec2d(), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+    for v in range(vertices):
+        if touching[env, v] != 0:
+            place = wp.vec2d(rest[v][0], rest[v][1])
+            u, p, arm = moved(displacement, env, v) - displaced(motion, place), vector(pattern, env, v, vertices), place - middle
+            mean_u += u / count
+            mean_p += p / count
+            size += wp.length_sq(arm)
+            # The arms sum to 0, so means have no part in these.
+            turn_u += arm[0] * u[1] - arm[1] * u[0]
+            turn_p += arm[0] * p[1] - arm[1] * p[0]
+    size = wp.max(size, wp.float64(1e-24))
+    pu, pp = wp.float64(0.0), wp.float64(0.0)
+    for v in range(vertices):
+        if touching[env, v] != 0:
+            place = wp.vec2d(rest[v][0], rest[v][1])
+            arm = place - middle
+            turn = wp.vec2d(-arm[1], arm[0])
+            u = moved(displacement, env, v) - displaced(motion, place) - mean_u - (turn_u / size) * turn
+            p = vector(pattern, env, v, vertices) - mean_p - (turn_p / size) * turn
+            pu += wp.dot(p, u)
+            pp += wp.dot(p, p)
+    share[env] = wp.where(pp > _0, wp.clamp(pu / pp, _0, _1), _1)
 
-    def __init__(self, normal: NormalCorrection, gelpad: GelpadSpec, compliance: np.ndarray) -> None:
-        """Prepare the tangential grid.
 
-        ``compliance``: displacement along x, y of each vertex over a force along x, y (first axis) on each [m/N], (2, 2, V, V), for a mesh
-        whose sides may not move outwards.
-        """
-        self._normal, self._settings = normal, normal.settings
-        self._compliance = compliance.astype(np.float32)
-        ends = [(t[0], t[-1]) for t in (normal.x, normal.y)]
-        pitch = self._settings.tangential_pitch
-        self._x, self._y = (np.linspace(low, high, round((high - low) / pitch) + 1) for low, high in ends)
-        x, y = CosineSeries(self._x), CosineSeries(self._y)
-        k = np.hypot(x.wave_numbers[None, :], y.wave_numbers[:, None])
-        cos_x, cos_y = (
-            k_axis / np.maximum(k, x.wave_numbers[1] * 1e-9) for k_axis in (x.wave_numbers[None, :], y.wave_numbers[:, None])
-        )
-        along, across = (law * y.hat[:, None] * x.hat for law in layer_shear(k, gelpad))
-        excess = along - across
-        laws = across + excess * cos_x**2, excess * cos_x * cos_y, across + excess * cos_y**2
-        self._layer = tuple(law.astype(np.float32) for law in laws)
-        self._analysis_x, self._analysis_y = (
-            tuple(m.astype(np.float32) for m in (series.analysis, series.sine_analysis)) for series in (x, y)
-        )
-        self._nodes = plane_waves(x, y, self._x, self._y)
-        self._vertices = plane_waves(x, y, normal.surface.mesh.lines_x, normal.surface.mesh.lines_y)
+@wp.kernel
+def spread_waves(
+    active: wp.array(dtype=wp.int32), spread_x: wp.array3d(dtype=wp.float32), spread_y: wp.array3d(dtype=wp.float32),
+    waves: wp.array3d(dtype=wp.float32),
+    # outputs
+    x: wp.array3d(dtype=wp.float32),
+    y: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
+    """Amplitudes of the layer's displacement sideways under pressure, by (environment, row)."""
+    env, row = wp.tid()
+    if active[env] == 0:
+        return
+    for i in range(x.shape[2]):
+        x[env, row, i] = spread_x[0, row, i] * waves[env, row, i]
+        y[env, row, i] = spread_y[0, row, i] * waves[env, row, i]
 
-    def correct(
-        self, contact: NormalContact, dragged: np.ndarray, touching: np.ndarray, load: np.ndarray, friction: float
-    ) -> np.ndarray:
-        """A τ − E q [m], (V, 2), at the coat's vertices.
 
-        Args:
-            contact: solution of the normal stage.
-            dragged: v [m], (V, 2), of which those ``touching`` (V,) count.
-            load: normal force on each vertex [N], (V,).
-            friction: μ > 0.
-        """
-        rest = self._normal.surface.mesh.rest[:, :2]
-        goal = PlaneMotion.fit(dragged[touching], rest[touching], load[touching])
-        waves = np.zeros((2, len(self._y), len(self._x)), np.float32)
-        if np.abs(goal.at(rest[touching])).max() > self._settings.motion_tolerance:
-            solution = self.solve(contact.pressure, goal, friction)
-            if solution is None:
-                return np.zeros_like(dragged)
-            waves = solution.waves
-        layer = plane_displacement(waves, self._vertices).reshape(2, -1)
-        blend = self._blend(layer.T[touching], dragged[touching], load[touching])
-        if blend == 0.0:
-            return np.zeros_like(dragged)
-        compliance = self._compliance[:, :, :, touching]
-        within = compliance[:, :, touching].transpose(1, 2, 0, 3).reshape(2 * touching.sum(), -1)
-        force = self._mesh_forces(within, dragged[touching].T.ravel().astype(np.float32))
-        mesh = product(compliance.transpose(1, 2, 0, 3).reshape(-1, len(force)), force[:, None]).reshape(2, -1)
-        return blend * (layer - mesh).T.astype(float)
+@wp.kernel
+def correct_spread(
+    touched: wp.array(dtype=wp.int32), corrects: wp.int32, rest: wp.array(dtype=wp.vec3d), lines: Lines,
+    field_x: wp.array3d(dtype=wp.float32), field_y: wp.array3d(dtype=wp.float32), sides: wp.array3d(dtype=wp.float32),
+    displacement: wp.array3d(dtype=wp.float64), mesh: wp.array2d(dtype=wp.float64), share: wp.array(dtype=wp.float64),
+    # outputs
+    sideways: wp.array2d(dtype=wp.float64),
+    dragged: wp.array2d(dtype=wp.float64),
+):  # fmt: skip
+    """Displacement u − θ (E − L) and what friction has dragged, u − θ E, (B, 2 V) [m].
 
-    def solve(self, pressure: np.ndarray, goal: PlaneMotion, friction: float) -> TangentialContact | None:
-        """Stick and slip under ``pressure`` [Pa] for a mean displacement ``goal``, or None."""
-        settings = self._settings
-        place = np.stack(np.meshgrid(self._x, self._y), axis=-1)
-
-        def pressure_at(displacement: np.ndarray, place: np.ndarray) -> np.ndarray:
-            now = (place + displacement).reshape(-1, 2)
-            return sampled(pressure, self._normal.x, self._normal.y, *now.T).reshape(place.shape[:2])
-
-        loaded = pressure_at(goal.at(place), place) > settings.least_load * pressure.max()
-        if not loaded.any():
-            return None
-        margin = 2 + int(0.3 * np.abs(goal.at(place)[loaded]).max() / settings.tangential_pitch)
-        rows, columns = (span(loaded.any(axis=k), margin) for k in (1, 0))
-        place, loaded = place[rows, columns], loaded[rows, columns]
-        (to_cos_x, to_sin_x), (to_cos_y, to_sin_y) = (
-            tuple(m[:, columns].T for m in self._analysis_x),
-            tuple(m[:, rows] for m in self._analysis_y),
-        )
-        window = tuple(m[:, columns] for m in self._nodes[0]), tuple(m[rows] for m in self._nodes[1])
-
-        def amplitudes(traction: np.ndarray) -> np.ndarray:
-            τx, τy = sandwich(to_cos_y, traction[0], to_sin_x), sandwich(to_sin_y, traction[1], to_cos_x)
-            return np.stack([self._layer[0] * τx + self._layer[1] * τy, self._layer[1] * τx + self._layer[2] * τy])
-
-        def respond(traction: np.ndarray) -> np.ndarray:
-            return plane_displacement(amplitudes(traction), window)
-
-        motion, bound = goal, friction * pressure_at(goal.at(place), place)
-        largest = _largest_compliance(respond, bound > 0.0)
-        if not largest > 0.0:
-            return None
-        traction, solution = np.zeros((2, *bound.shape), np.float32), None
-        for _ in range(settings.slip_iterations):
-            target = np.moveaxis(motion.at(place), -1, 0)
-            traction = _projected_gradients(
-                traction, target, bound.astype(np.float32), 1.0 / largest, respond, settings.traction_iterations
+    By (environment, vertex).
+    """
+    env, v = wp.tid()
+    vertices = len(rest)
+    u = moved(displacement, env, v)
+    result, drag = wp.vec2d(u[0], u[1]), wp.vec2d(u[0], u[1])
+    if touched[env] != 0:
+        θ = share[env]
+        E = vector(mesh, env, v, vertices)
+        drag = u - θ * E
+        if corrects != 0:
+            place = wp.vec2d(rest[v][0], rest[v][1]) + u
+            L = wp.vec2d(
+                sampled(field_x, env, lines, place) - wp.float64(sides[0, env, v]),
+                sampled(field_y, env, lines, place) - wp.float64(sides[0, env, vertices + v]),
             )
-            waves = amplitudes(traction)
-            displacement = plane_displacement(waves, window)
-            solution = TangentialContact(place, traction, bound, displacement, waves)
-            mean = PlaneMotion.fit(np.moveaxis(displacement, 0, -1).reshape(-1, 2), place.reshape(-1, 2), bound.ravel())
-            inside = place[bound > 0.0]
-            error = goal.at(inside) - mean.at(inside)
-            sticks = np.hypot(*traction) < 0.999 * bound
-            slip = np.hypot(*(displacement - target))[sticks].max(initial=0.0)
-            if np.abs(error).max() < settings.motion_tolerance and slip < settings.stick_tolerance:
-                break
-            if sticks.sum() < settings.sliding_share * len(inside):
-                friction *= max(float((goal.at(inside) ** 2).sum() / (goal.at(inside) * mean.at(inside)).sum()), 1.0)
-            motion = motion.plus(goal, mean)
-            bound = friction * np.where(loaded, pressure_at(np.moveaxis(displacement, 0, -1), place), 0.0)
-            if not (bound > 0.0).any():
-                break
-        return solution
-
-    def _blend(self, layer: np.ndarray, displacement: np.ndarray, weight: np.ndarray) -> float:
-        """Weight of the correction in [0, 1]: less, the less the ``layer`` explains."""
-        s = self._settings
-        error, size = (float(weight @ (field**2).sum(axis=1)) for field in (layer - displacement, displacement))
-        missed = np.sqrt(error / (size + weight.sum() * s.small_motion**2))
-        return float(np.clip((s.no_blend - missed) / (s.no_blend - s.full_blend), 0.0, 1.0))
-
-    def _mesh_forces(self, compliance: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-        """Forces [N] whose linear response is ``displacement`` [m], (n,), by conjugate gradients.
-
-        Unknowns that cannot move (the pad's sides across themselves, whose rows of ``compliance`` are 0) have no force.
-        """
-        free = np.diagonal(compliance) > 0.0
-        A, b = np.ascontiguousarray(compliance[np.ix_(free, free)]), displacement[free]
-        x, r, p = np.zeros_like(b), b.copy(), b.copy()
-        rr = float(r @ r)
-        for _ in range(self._settings.force_iterations):
-            if np.abs(r).max(initial=0.0) < self._settings.motion_tolerance:
-                break
-            Ap = product(A, p[:, None])[:, 0]
-            pAp = float(p @ Ap)
-            if not pAp > 0.0:  # only rounding of float32 remains
-                break
-            alpha = np.float32(rr / pAp)
-            x, r = x + alpha * p, r - alpha * Ap
-            rr, last = float(r @ r), rr
-            beta = np.float32(rr / last)
-            p = r + beta * p
-        force = np.zeros_like(displacement)
-        force[free] = x
-        return force
-
-
-def _projected_gradients(
-    τ: np.ndarray, target: np.ndarray, bound: np.ndarray, step: float, respond: Response, iterations: int
-) -> np.ndarray:
-    """Traction |τ| <= ``bound`` (n, m) whose response approaches ``target`` (2, n, m).
-
-    Accelerated projected gradients with restarts (B. O'Donoghue and E. Candès, Found. Comput. Math. 15, 2015).
-    """
-    τ = y = _project(τ, bound)
-    t = 1.0
-    for _ in range(iterations):
-        new = _project(y - step * (respond(y) - target), bound)
-        if float(((y - new) * (new - τ)).sum()) > 0.0:
-            t = 1.0
-        t_new = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * t * t))
-        y = new + (t - 1.0) / t_new * (new - τ)
-        τ, t = new, t_new
-    return τ
-
-
-def _project(traction: np.ndarray, bound: np.ndarray) -> np.ndarray:
-    """Traction (2, n, m) shortened to the ``bound`` (n, m) >= 0, in its own direction."""
-    size = np.hypot(*traction)
-    return (traction * np.minimum(1.0, bound / np.maximum(size, 1e-12))).astype(np.float32)
-
-
-def _largest_compliance(respond: Response, inside: np.ndarray) -> float:
-    """Bound of displacement over traction [m/Pa], by power iteration; 0 if nothing can move."""
-    trial = np.stack([inside, inside]).astype(np.float32)
-    size = 0.0
-    for _ in range(3):
-        response = respond(trial) * inside
-        if not response.any():
-            return 0.0
-        size = float(np.linalg.norm(response) / np.linalg.norm(trial))
-        trial = response / np.float32(np.abs(response).max())
-    return 1.15 * size
+            result = u - θ * (E - L)
+    sideways[env, v] = result[0]
+    sideways[env, vertices + v] = result[1]
+    dragged[env, v] = drag[0]
+    dragged[env, vertices + v] = drag[1]
 
 
 class TangentialCorrection:
-    """Corrects the skin's spread under pressure and its drag by friction, one pad at a time.
+    """Corrects the skin's spread under pressure and its drag by friction.
 
     Nearly incompressible gel moves sideways under pressure. A mesh whose cells are as wide as the contact pushes it out far too much.
-    Let E be what the mesh does sideways under the normal forces of ``NormalContact``, and L the layer's own response to the pressure on the
-    fine grid. Friction has let only a share θ of that spread happen, and the rest of the solver's displacement u (shear, twist) says
+    Let E be what the mesh does sideways under the normal forces of ``NormalCorrection``, and L the layer's own response to the pressure on
+    the fine grid. Friction has let only a share θ of that spread happen, and the rest of the solver's displacement u (shear, twist) says
     nothing of it. So the skin's displacement becomes
 
         u − θ (E − L),   θ = ⟨u, E⟩ / ⟨E, E⟩ within [0, 1],
@@ -301,6 +153,10 @@ class TangentialCorrection:
     θ = 0. The finer the mesh, the smaller is E − L. One θ holds for all of a pad's contact.
 
     The remainder in contact, u − θ E, is due to friction. How far the skin around follows it is corrected by ``FrictionCorrection``.
+
+    Attributes:
+        displacement: of the vertices, corrected, (B, 2 V), float64 [m], all x and then all y, of the last ``correct``.
+        share: θ, (B,), float64.
     """
 
     def __init__(self, normal: NormalCorrection, gelpad: GelpadSpec, compliance: np.ndarray, continued: np.ndarray) -> None:
@@ -310,63 +166,47 @@ class TangentialCorrection:
             compliance: displacements along x, y, z of the vertices over a force along z on each [m/N], (3, V, V).
             continued: the same over a force along x, y, z (first axis) if the pad's sides may not move outwards, (3, 3, V, V).
         """
-        self._friction = FrictionCorrection(normal, gelpad, continued[:2, :2])
-        self._normal, self._settings = normal, normal.settings
-        self._mesh = compliance[:2].astype(np.float32)
-        self._sides = (compliance[:2] - continued[2, :2]).astype(np.float32)
+        self._normal, self._settings, products = normal, normal.settings, normal.products
+        self._products, device, vertices = products, products.device, len(compliance[0])
+        self._friction = FrictionCorrection(normal, gelpad, continued[:2, :2]) if self._settings.friction else None
+        self._mesh = wp.array(compliance[:2].reshape(2 * vertices, vertices), dtype=wp.float64, device=device)
+        self._side_law = products.constant((compliance[:2] - continued[2, :2]).reshape(2 * vertices, vertices).T)
         pitch = self._settings.tangential_pitch
-        self._x, self._y = (t[:: max(round(pitch / (t[1] - t[0])), 1)] for t in (normal.x, normal.y))
-        series_x, series_y = normal.series_x, normal.series_y
-        resolved = (s.wave_numbers * (t[1] - t[0]) <= np.pi for s, t in ((series_y, self._y), (series_x, self._x)))
-        self._resolved = np.ix_(*resolved)
-        k_y, k_x = (s.wave_numbers[np.ravel(k)] for s, k in zip((series_y, series_x), self._resolved, strict=True))
+        x, y = (t[:: max(round(pitch / (t[1] - t[0])), 1)] for t in (normal.x, normal.y))
+        series = normal.series_x, normal.series_y
+        resolved = [int((one.wave_numbers * (t[1] - t[0]) <= np.pi).sum()) for one, t in zip(series, (x, y), strict=True)]
+        (k_x, hat_x), (k_y, hat_y) = (one.hats(np.arange(count)) for one, count in zip(series, resolved, strict=True))
         k = np.hypot(k_x[None, :], k_y[:, None])
-        ratio = layer_spread(k, gelpad) / layer_compliance(k, gelpad) / np.maximum(k, k_x[1])
-        self._spread = np.stack([ratio * k_x, ratio * k_y[:, None]]).astype(np.float32)
-        over_x, over_y = plane_waves(series_x, series_y, self._x, self._y)
-        self._lines = tuple(np.asfortranarray(m[: len(k_x)]) for m in over_x), tuple(m[:, : len(k_y)] for m in over_y)
+        ratio = layer_spread(k, gelpad) * (hat_y[:, None] * hat_x) / np.maximum(k, k_x[1])
+        self._spread = [products.constant(ratio * along).numbers for along in (k_x, k_y[:, None])]
+        shape = len(k_y), len(k_x)
+        self._synthesis, self._lines = PlaneWaves(series, x, y, products, shape), node_lines(x, y)
+        self._waves, self._field = PlaneField.zeros(products, *shape), PlaneField.zeros(products, len(y), len(x))
+        self._sides = products.zeros(products.num_envs, 2 * vertices, num_envs=1)
+        count = products.num_envs
+        self._response, self.displacement, self._dragged = (
+            wp.zeros((count, 2 * vertices), dtype=wp.float64, device=device) for _ in range(3)
+        )
+        self.share = wp.zeros(count, dtype=wp.float64, device=device)
 
-    def sideways(
-        self, contact: NormalContact, displacement: np.ndarray, load: np.ndarray, friction: float | None = None
-    ) -> np.ndarray:
-        """Corrected displacement along x, y [m], (V, 2).
+    def correct(self, objects: Touched) -> None:
+        """Launch the correction, after the solution of the normal contact."""
+        normal, settings, active = self._normal, self._settings, self._normal.search.touched
+        rest, moved, vertices = normal.surface.struct.rest, normal.surface.displacement, len(normal.surface.mesh.rest)
+        inputs = [self._mesh, normal.holding.unknowns, normal.mesh_forces, self._response]
+        self._launch(force_kernels.respond, self._response.shape, inputs)
+        shares = [active, normal.touching, rest, moved, self._response, self.share]
+        self._launch(find_shares, len(self.share), shares)
+        if settings.tangential:
+            amplitudes = [normal.waves.numbers, self._waves.x.numbers, self._waves.y.numbers]
+            self._launch(spread_waves, (len(active), self._waves.x.shape[0]), [active, *self._spread, *amplitudes])
+            self._synthesis.displacement(self._waves, self._field, active)
+            self._products.multiply(normal.forces, self._side_law, self._sides)
+        field = [self._field.x.numbers, self._field.y.numbers, self._sides.numbers]
+        inputs = [active, int(settings.tangential), rest, self._lines, *field, moved, self._response, self.share]
+        self._launch(correct_spread, (len(active), vertices), [*inputs, self.displacement, self._dragged])
+        if self._friction is not None:
+            self._friction.correct(self._dragged, objects, self.displacement)
 
-        Args:
-            contact: solution of the normal stage.
-            displacement: u of the solver's vertices [m], (V, 3).
-            load: normal force on each [N], (V,).
-            friction: μ; None or 0 leaves the effect of friction as the mesh has it.
-        """
-        rest, touching = self._normal.surface.mesh.rest, self._normal.touching(load)
-        u = displacement[:, :2]
-        mesh = product(self._mesh.reshape(-1, len(rest)), contact.mesh_forces[:, None]).reshape(2, -1).T
-        θ = _share(mesh[touching], u[touching], rest[touching, :2])
-        corrected = u.copy()
-        if self._settings.tangential:
-            corrected -= θ * (mesh - self._layer(contact, rest[:, 0] + u[:, 0], rest[:, 1] + u[:, 1]))
-        if self._settings.friction and friction:
-            corrected += self._friction.correct(contact, u - θ * mesh, touching, load, friction)
-        return corrected
-
-    def _layer(self, contact: NormalContact, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """L: sideways displacement of the layer under the fine grid's pressure [m], (V, 2)."""
-        field = plane_displacement(self._spread * contact.waves[self._resolved], self._lines)
-        force = sandwich(self._normal.force_y, contact.pressure, self._normal.force_x).reshape(-1, 1)
-        sides = product(self._sides.reshape(-1, len(force)), force).reshape(2, -1)
-        return (sampled(field, self._x, self._y, x, y) - sides).T
-
-
-def _share(pattern: np.ndarray, displacement: np.ndarray, place: np.ndarray) -> float:
-    """Share in [0, 1] of a ``pattern`` (T, 2) in a ``displacement``, besides rigid motions."""
-    displacement = displacement - PlaneMotion.fit(displacement, place, np.ones(len(place))).at(place)
-    arm = place - place.mean(axis=0)
-    turn = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
-    turn /= max(float(np.linalg.norm(turn)), 1e-12)
-
-    def without_rigid(field: np.ndarray) -> np.ndarray:
-        field = field - field.mean(axis=0)
-        return field - (field * turn).sum() * turn
-
-    pattern, displacement = without_rigid(pattern), without_rigid(displacement)
-    size = float((pattern**2).sum())
-    return float(np.clip((pattern * displacement).sum() / size, 0.0, 1.0)) if size > 0.0 else 1.0
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, device=self._products.device)

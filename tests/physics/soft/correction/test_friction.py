@@ -11,19 +11,19 @@ import pytest
 
 from raytac.gel.surface import make_grid
 from raytac.physics.bonded_layer import layer_shear
-from raytac.physics.soft.coat_surface import CoatSurface
-from raytac.physics.soft.correction import tangential
 from raytac.physics.soft.correction.mesh_compliance import coat_compliance
-from raytac.physics.soft.correction.normal import NormalCorrection
-from raytac.physics.soft.correction.tangential import (
+from raytac.physics.soft.mesh import PadLevel, pad_mesh
+from raytac.specs import load_sensor
+from tests.physics.soft.oracles import tangential
+from tests.physics.soft.oracles.coat_surface import CoatSurface
+from tests.physics.soft.oracles.normal import NormalCorrection
+from tests.physics.soft.oracles.tangential import (
     FrictionCorrection,
     PlaneMotion,
     TangentialCorrection,
     _share,
     plane_displacement,
 )
-from raytac.physics.soft.mesh import PadLevel, pad_mesh
-from raytac.specs import load_sensor
 
 GELPAD = load_sensor("gelsight_mini").gelpad
 MESH = pad_mesh(GELPAD, PadLevel(2.0e-3, 3, 1.5, 1.5, 5e-5))

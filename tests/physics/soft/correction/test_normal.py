@@ -11,14 +11,14 @@ import pytest
 from raytac.gel.interpolate import sampled
 from raytac.gel.surface import make_grid
 from raytac.physics.bonded_layer import layer_compliance, layer_spread
-from raytac.physics.soft.coat_surface import CoatSurface
 from raytac.physics.soft.correction.cosine_series import CosineSeries
 from raytac.physics.soft.correction.mesh_compliance import coat_compliance, rest_stiffness
-from raytac.physics.soft.correction.normal import ContactSampler, NormalCorrection, _smoothing
-from raytac.physics.soft.correction.tangential import TangentialCorrection
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
 from raytac.physics.soft.settings import Correction
 from raytac.specs import load_sensor
+from tests.physics.soft.oracles.coat_surface import CoatSurface
+from tests.physics.soft.oracles.normal import ContactSampler, NormalCorrection, _smoothing
+from tests.physics.soft.oracles.tangential import TangentialCorrection
 
 GELPAD = load_sensor("gelsight_mini").gelpad
 MESH = pad_mesh(GELPAD, PadLevel(2.5e-3, 3, 1.5, 1.5, 5e-5))
