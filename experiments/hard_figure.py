@@ -25,7 +25,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import LinearSegmentedColormap, PowerNorm
 from matplotlib.patches import Rectangle
 
-__all__ = ["State", "draw_last_states", "state_of"]
+__all__ = ["State", "draw_last_states", "load_state", "save_state", "state_of"]
 
 Floats = NDArray[np.floating]
 
@@ -37,10 +37,17 @@ LIGHT = np.array([-0.3, -0.55, 0.78])
 VIEWS: dict[str, tuple[float, float]] = {
     **dict.fromkeys(("spike_in_hole", "spike_in_crack", "wedge_in_crack"), (32, -58)),
     **dict.fromkeys(("mass_ratio_1e4", "crush"), (-3, -62)),
+    **dict.fromkeys(("gears_soft", "gears_affine", "heap_of_30"), (50, -70)),
+    **dict.fromkeys(("rollers_draw_in", "rollers_slip", "rollers_coated"), (12, -75)),
 }
 """Elevation and azimuth [deg] where the usual ones show little."""
 USUAL_VIEW = (20, -62)
-SEE_THROUGH = ("spike_in_hole", "spike_in_crack", "wedge_in_crack", "slotted_tetrahedron", "squeeze_and_release", "blocked_drive")
+SEE_THROUGH = (
+    *("spike_in_hole", "spike_in_crack", "wedge_in_crack", "slotted_tetrahedron", "squeeze_and_release", "blocked_drive"),
+    *("heap_of_30", "squeeze_out", "trash_compactor_soft", "trash_compactor_mixed", "trash_compactor_affine"),
+    *("nut_and_bolt_soft", "nut_and_bolt_affine", "peg_in_hole_soft", "peg_in_hole_affine"),
+    *("squeezed_nu_0495", "squeezed_nu_0499"),
+)
 INSETS = {"mass_ratio_1e4": "lower", "crush": "lower"}
 """Bodies that are too small to be seen beside the others of their case; they are drawn once more."""
 PIECES = 20
@@ -100,6 +107,24 @@ def state_of(world: ipc.World) -> State:
     return State(tuple(surfaces), floor)
 
 
+def save_state(state: State, path: Path) -> None:
+    """Keep a state in an ``.npz`` file."""
+    arrays = {f"triangles_{s.name}": s.triangles for s in state.surfaces}
+    arrays |= {f"traction_{s.name}": s.traction for s in state.surfaces if s.traction is not None}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if state.floor is not None:
+        arrays["floor"] = np.array(state.floor)
+    np.savez_compressed(path, allow_pickle=False, **arrays)
+
+
+def load_state(path: Path) -> State:
+    """State that :func:`save_state` kept."""
+    with np.load(path) as file:
+        names = [key.removeprefix("triangles_") for key in file if key.startswith("triangles_")]
+        surfaces = tuple(Surface(n, file[f"triangles_{n}"], file.get(f"traction_{n}")) for n in names)
+        return State(surfaces, float(file["floor"]) if "floor" in file else None)
+
+
 def draw_last_states(states: Mapping[str, State], path: Path) -> None:
     """Draw every state in a panel of its own and save the picture to ``path``."""
     columns = min(COLUMNS, len(states))
@@ -123,7 +148,8 @@ def draw_last_states(states: Mapping[str, State], path: Path) -> None:
 
 def _title(name: str) -> str:
     """A case's name in words: ``dt_10ms`` is dt 10 ms."""
-    return re.sub(r"(\d)(m?s)$", r"\1 \2", name.replace("_", " ").replace("1e4", "10⁴"))
+    words = name.replace("_", " ").replace("1e4", "10⁴").replace("nu 0", "ν 0.").replace("mu 5", "μ 5").replace("d hat", "d̂")
+    return re.sub(r"(\d)(nm|um|mm|ms|s)\b", r"\1 \2", words).replace(" um", " µm")
 
 
 def _traction_text(pascal: float) -> str:

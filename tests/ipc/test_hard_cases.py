@@ -4,17 +4,36 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import ipctk
-import numpy as np
 import pytest
 
 import ipc
+from tests.ipc.hard.cases import CASES, GROUPS
 from tests.ipc.hard.run import MAX_NEWTON, Mechanics, Setup, Worst
-from tests.ipc.hard.scenes import CASES, SOFT, random_presses
+from tests.ipc.hard.scenes import SOFT, random_presses
 from tests.ipc.hard.shapes import cube
 
 SLOW = ["crush", "beam_twist", "mat_twist", "squeeze_and_release", "edge_alignment", "wedge_out_of_crack"]
-"""Those that take longer than some two seconds."""
+"""Basic cases that take longer than some two seconds."""
+QUICK = [
+    *(name for name in GROUPS["basic"] if name not in SLOW),
+    *(
+        "steep_slope_holds_soft",
+        "steep_slope_holds_affine",
+        "steep_slope_slides_soft",
+        "steep_slope_slides_affine",
+        "chain_affine",
+    ),
+    *("peg_in_hole_affine", "needle_nu_0495", "d_hat_1um_soft", "d_hat_1um_affine", "d_hat_1mm_soft"),
+    *("start_gap_1nm_soft", "start_gap_1nm_affine", "start_gap_1nm_soft_on_affine"),
+]
+FAILING = {
+    "dominoes_soft": "from 15 renewals of friction on only the sum of its limits has to settle: one step's forces are 6 % off balance",
+    "heap_of_30": "one of 60 steps does not converge, and a light body's forces are 6.8 % off its change of momentum",
+    "mat_twist_10_turns": "the mat snaps: in 2 of 160 steps a solve takes up its 200 Newton iterations",
+    "trash_compactor_mixed": "one step: friction of affine bodies that are hardly pressed does not settle in 30 renewals",
+    "d_hat_1mm_affine": "one landing: friction renewed 30 times still changes by 13 %; the changes shrink by 3 % each",
+}
+"""Cases that the solver does not pass, with the cause. A test here that passes fails: take it off the list then."""
 SETUP = Setup()
 FALL = ipc.Settings(gravity=(0.0, 0.0, -9.81))
 
@@ -22,35 +41,28 @@ FALL = ipc.Settings(gravity=(0.0, 0.0, -9.81))
 def check(name: str, worst: Worst, most: int = MAX_NEWTON) -> None:
     """``most``: Newton iterations a step."""
     said = f"{name}: gap {worst.min_gap:.3g} m, det F {worst.min_det:.3g}, {worst.max_newton} Newton iterations, {worst.notes}"
-    assert worst.passed(), f"{said}, {worst.unconverged} of {worst.steps} steps unconverged, surfaces cross in {worst.crossed}"
+    crossed = f"surfaces cross in {worst.crossed}, by ipctk in {worst.crossed_by_oracle}"
+    assert worst.passed(), f"{said}, {worst.unconverged} of {worst.steps} steps unconverged, {crossed}"
     assert worst.max_newton <= most, said
-    assert worst.world is not None
-    if worst.jams:
-        return  # gaps there are below what the oracle's floating point can tell from none
-    layout, x = worst.world.layout, np.asfortranarray(surface_positions(worst.world))
-    assert not ipctk.has_intersections(ipctk.CollisionMesh(x, layout.edges, layout.faces), x), f"{name}: surfaces cross"
 
 
-def surface_positions(world: ipc.World) -> np.ndarray:
-    """World positions of all surface vertices of the first environment, (V, 3)."""
-    parts = []
-    for body in world.bodies:
-        if isinstance(body, ipc.SoftBody):
-            parts.append(world.positions(body.name)[0][world.surface(body.name)[0]])
-        elif not isinstance(body, ipc.HalfSpace):
-            parts.append(world.positions(body.name)[0])
-    return np.concatenate(parts)
-
-
-@pytest.mark.parametrize("name", [n for n in CASES if n not in SLOW])
+@pytest.mark.parametrize("name", QUICK)
 def test_quick_cases_pass(name: str) -> None:
     check(name, CASES[name](SETUP))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SLOW)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.xfail(reason=FAILING[name], strict=True)) if name in FAILING else name
+        for name in CASES
+        if name not in QUICK
+    ],
+)
 def test_slow_cases_pass(name: str) -> None:
-    check(name, CASES[name](SETUP))
+    """Those that renew friction often take several solves a step."""
+    check(name, CASES[name](SETUP), most=MAX_NEWTON if name in GROUPS["basic"] else 5 * MAX_NEWTON)
 
 
 @pytest.mark.slow
@@ -80,6 +92,7 @@ def test_a_case_that_did_not_happen_fails() -> None:
     assert not replace(good, unconverged=1).passed()
     assert replace(good, unconverged=1, jams=True).passed()
     assert not replace(good, crossed=1, jams=True).passed()
+    assert not replace(good, crossed_by_oracle=1, jams=True).passed()
     assert not replace(good, finite=False).passed()
     assert not replace(good, notes=["missed"]).passed()
 

@@ -106,6 +106,13 @@ def about(axis: tuple[float, float, float], angle: float) -> NDArray[np.float64]
     return np.array([np.cos(angle / 2), *(np.sin(angle / 2) * unit)])
 
 
+def then(first: NDArray, second: NDArray) -> tuple[float, float, float, float]:
+    """The quaternion (w, x, y, z) of the turn ``first`` and then ``second``."""
+    w = second[0] * first[0] - second[1:] @ first[1:]
+    x, y, z = second[0] * first[1:] + first[0] * second[1:] + np.cross(second[1:], first[1:])
+    return float(w), float(x), float(y), float(z)
+
+
 def dented_ball(radius: float) -> ipc.TriMesh:
     """A coarse ball whose lower cap is turned inwards."""
     ball = ipc.icosphere(radius, 1)
