@@ -68,6 +68,17 @@ def circles_on_pad(sensor: SensorSpec, circles: np.ndarray, ball_radius: np.ndar
     return np.stack([x, y, r * px * (1 + z / distance)], axis=1)
 
 
+def rims_on_pad(sensor: SensorSpec, circles: np.ndarray, ball_radius: np.ndarray) -> np.ndarray:
+    """``circles_on_pad`` of balls that touch; InputError: a circle as wide as its ball."""
+    on_pad = circles_on_pad(sensor, circles, ball_radius)
+    share = on_pad[:, 2] / ball_radius
+    if (share >= 1).any():
+        k = int(np.argmax(share))
+        rule = f"must be smaller than the ball, which has {2e3 * ball_radius[k]:.4g} mm"
+        raise InputError("circle", value=f"{2e3 * on_pad[k, 2]:.4g} mm across", rule=rule)
+    return on_pad
+
+
 def pixel_geometry(
     sensor: SensorSpec,
     u: np.ndarray,
@@ -113,13 +124,9 @@ def pixel_geometry(
 def press_surface(
     sensor: SensorSpec, grid: PadGrid, circles: np.ndarray, ball_radius: np.ndarray, slopes: np.ndarray
 ) -> GelSurface:
-    """The pad under every ball, a batch on ``grid``; InputError: a circle as wide as its ball."""
-    on_pad = circles_on_pad(sensor, circles, ball_radius)
+    """The pad under every ball, a batch on ``grid``; InputError as of ``rims_on_pad``."""
+    on_pad = rims_on_pad(sensor, circles, ball_radius)
     share = on_pad[:, 2] / ball_radius
-    if (share >= 1).any():
-        k = int(np.argmax(share))
-        rule = f"must be smaller than the ball, which has {2e3 * ball_radius[k]:.4g} mm"
-        raise InputError("circle", value=f"{2e3 * on_pad[k, 2]:.4g} mm across", rule=rule)
     heights, contact = [], []
     rest = rest_height(sensor.gelpad, *np.meshgrid(grid.x, grid.y))
     for (x, y, a), profile in zip(on_pad, _heights(slopes, share), strict=True):

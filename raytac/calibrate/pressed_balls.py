@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from raytac.calibrate.imprint import circles_on_pad
+from raytac.calibrate.imprint import rims_on_pad
 from raytac.gel.surface import GelSurface
 from raytac.physics.base import PhysicsConfig
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
@@ -63,9 +63,9 @@ def pressed_balls(
     ``circles`` (N, 3) [px of the sensor's resolution], ``ball_radius`` (N,) [m]; ``pitch`` of the surfaces' grid [m]; ``device``:
     that of a solver. Each press goes on from stage to stage, the depths of which are those of the secant through the last two.
 
-    Raises as ``PhysicsConfig.build``.
+    Raises ``InputError``: a circle as wide as its ball; else as ``PhysicsConfig.build``.
     """
-    for (x, y, a), radius in zip(circles_on_pad(sensor, circles, ball_radius), ball_radius, strict=True):
+    for (x, y, a), radius in zip(rims_on_pad(sensor, circles, ball_radius), ball_radius, strict=True):
         yield _pressed(sensor, (float(x), float(y)), float(a), float(radius), physics, pitch, device)
 
 

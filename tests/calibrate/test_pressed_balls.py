@@ -35,9 +35,9 @@ def test_contact_is_as_wide_as_the_circle(physics: PhysicsConfig) -> None:
 
 def test_a_circle_that_no_depth_reaches_has_no_surface() -> None:
     """A contact of 0.999 of the ball's radius would need the ball to be drowned."""
-    circles = np.array([[160.0, 120.0, 0.0]])
-    small = np.array([0.5e-3])
-    circles[0, 2] = 0.999 * small[0] / MINI.camera.pixel_pitch[0] * 1.03
+    small, circles = np.array([0.5e-3]), np.array([[160.0, 120.0, 1.0]])
+    for _ in range(9):
+        circles[0, 2] *= 0.999 * small[0] / circles_on_pad(MINI, circles, small)[0, 2]
     (ball,) = pressed_balls(MINI, circles, small, Rigid(), pitch=PITCH, device="cpu")
     assert ball.surface is None and np.isnan(ball.depth) and ball.at_overlap.contact.any()
 
