@@ -396,7 +396,7 @@ def frames(optics: str, args: Args) -> dict[str, Metric]:
 def pressed_pads(sensor: TactileSensor, count: int, seed: int) -> GelSurface:
     """Pads into which balls of 3 to 8 mm and boxes are pressed by 0.2 to 1 mm at random places; the gel as the rigid pad shows it."""
     rng, grid = np.random.default_rng(seed), sensor.grid
-    gel, low = ElasticSurround(grid), float(grid.rest.min())
+    gel, low = ElasticSurround(grid, thickness=sensor.spec.gelpad.thickness), float(grid.rest.min())
     height = np.full((count, *grid.shape), np.inf)
     for b in range(count):
         if b % 2:

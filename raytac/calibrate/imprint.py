@@ -21,8 +21,8 @@ from raytac.specs.sensor import SensorSpec
 
 KNOTS = np.array([0.0, 0.3, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5, 1.75, 2.0, 2.4, 3.0])
 """Distances over the contact radius between which the slope is linear; 0 at both ends."""
-RIGID_PAD = np.array([0.3, 0.6, 0.69, 0.76, 0.72, 0.58, 0.46, 0.36, 0.24, 0.15, 0.06, 0.02, 0.01])
-"""s at the inner knots, about the rigid pad's (docs/rigid-pad.md): where a fit starts."""
+RIGID_PAD = np.array([0.3, 0.6, 0.7, 0.8, 0.9, 0.86, 0.49, 0.39, 0.26, 0.16, 0.05, 0.01, 0.0])
+"""s at the inner knots, about the rigid pad's where its contact is as wide as the circle: where a fit starts."""
 WIDEST = 0.95
 """Largest sine of a slope."""
 _TABLE = np.linspace(0, KNOTS[-1], 751)
@@ -66,6 +66,17 @@ def circles_on_pad(sensor: SensorSpec, circles: np.ndarray, ball_radius: np.ndar
         y = camera.position[1] + (v - cy) * py * (1 + z / distance)
         z = -sensor.gelpad.sag(x, y) - deep
     return np.stack([x, y, r * px * (1 + z / distance)], axis=1)
+
+
+def rims_on_pad(sensor: SensorSpec, circles: np.ndarray, ball_radius: np.ndarray) -> np.ndarray:
+    """``circles_on_pad`` of balls that touch; InputError: a circle as wide as its ball."""
+    on_pad = circles_on_pad(sensor, circles, ball_radius)
+    share = on_pad[:, 2] / ball_radius
+    if (share >= 1).any():
+        k = int(np.argmax(share))
+        rule = f"must be smaller than the ball, which has {2e3 * ball_radius[k]:.4g} mm"
+        raise InputError("circle", value=f"{2e3 * on_pad[k, 2]:.4g} mm across", rule=rule)
+    return on_pad
 
 
 def pixel_geometry(
@@ -113,13 +124,9 @@ def pixel_geometry(
 def press_surface(
     sensor: SensorSpec, grid: PadGrid, circles: np.ndarray, ball_radius: np.ndarray, slopes: np.ndarray
 ) -> GelSurface:
-    """The pad under every ball, a batch on ``grid``; InputError: a circle as wide as its ball."""
-    on_pad = circles_on_pad(sensor, circles, ball_radius)
+    """The pad under every ball, a batch on ``grid``; InputError as of ``rims_on_pad``."""
+    on_pad = rims_on_pad(sensor, circles, ball_radius)
     share = on_pad[:, 2] / ball_radius
-    if (share >= 1).any():
-        k = int(np.argmax(share))
-        rule = f"must be smaller than the ball, which has {2e3 * ball_radius[k]:.4g} mm"
-        raise InputError("circle", value=f"{2e3 * on_pad[k, 2]:.4g} mm across", rule=rule)
     heights, contact = [], []
     rest = rest_height(sensor.gelpad, *np.meshgrid(grid.x, grid.y))
     for (x, y, a), profile in zip(on_pad, _heights(slopes, share), strict=True):

@@ -9,7 +9,9 @@ from typing import Annotated
 
 import tyro
 
-from raytac.cli.shared import FitOptions, print_paths
+from raytac.cli.shared import FitOptions, named, print_paths
+from raytac.physics.soft.availability import quiet_solver
+from raytac.specs.press import PADS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,11 +36,18 @@ class CompareRealArgs(FitOptions):
     """Also fit the ray tracer with one thing after another left out."""
     shadows: bool = False
     """Let the ray tracer cast shadows on the coat; a real Mini shows next to none."""
+    imprint: str = "fitted"
+    """Imprints to compare, joined by commas: fitted, rigid, ipc (docs/real-images.md).
+
+    Under rigid and ipc the pad's physics gives the gel's surface, at the depth where the contact is as wide as the label's circle."""
+    imprint_level: Annotated[str, named(PADS)] = "medium"
+    """Mesh of the soft pad of `--imprint ipc`."""
 
     def run(self) -> int:
         began = time.perf_counter()
         from raytac.report.real import RealSettings, check_folds, compare_real
 
+        quiet_solver()
         sensor, presses, shots = self.read(self.data, self.sensor)
         check_folds(presses, self.folds)
         settings = RealSettings(
@@ -50,6 +59,8 @@ class CompareRealArgs(FitOptions):
             rounds=self.rounds,
             prior=self.chosen_prior,
             shadows=self.shadows,
+            imprints=tuple(self.imprint.split(",")),
+            level=self.imprint_level,
             device=self.device,
             seed=self.seed,
         )

@@ -1,4 +1,4 @@
-"""Discrete Gaussians as matrices, and the widths of Taxim's pyramid."""
+"""Discrete Gaussians as matrices, and the widths of the two pyramids that are made of them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,18 @@ PYRAMID_SIGMAS = tuple(s * _TAXIM_PIXEL for s in (30.5, 15.5, 8.0, 3.5, 2.0, 1.1
 """Standard deviations of Taxim's pyramid [m].
 
 OpenCV's automatic σ for kernels 201, 101, 51, 21, 11, 5 at 0.0295 mm a pixel."""
+LAYER_STEPS = (
+    (0.1067, 1.0),
+    (0.1206, 1.0),
+    (0.0875, 1.0),
+    (0.0660, 0.9423),
+    (0.0361, 0.9475),
+    (0.0192, 0.9561),
+    (0.0118, 0.9640),
+)
+"""Standard deviation over the gel's thickness, and gain, of each Gaussian of an elastic layer.
+
+Fitted to contacts of a linear elastic layer bonded at its back (``experiments/fit_surround.py``)."""
 FINAL_SIGMA = 1.1 * _TAXIM_PIXEL
 """Standard deviation of the last smoothing [m]."""
 CONTACT_SCALE = 0.4

@@ -1,4 +1,4 @@
-"""The gel around a contact: Taxim's pyramid of Gaussians with the contact re-imposed."""
+"""The gel around a contact: Gaussians with the contact re-imposed, as of an elastic layer or of Taxim."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from raytac.checks import check_known
+from raytac.checks import check_known, check_number
 from raytac.gel import surround_kernels as kernels
 from raytac.gel.components import boxes
-from raytac.gel.gaussian import CONTACT_SCALE, FINAL_SIGMA, PYRAMID_SIGMAS, gaussian_matrix
+from raytac.gel.gaussian import CONTACT_SCALE, FINAL_SIGMA, LAYER_STEPS, PYRAMID_SIGMAS, gaussian_matrix
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.warp_runtime import HostArrays, Recorded, start_warp
 
@@ -37,19 +37,22 @@ So they stay in a core's cache.
 
 
 class ElasticSurround:
-    """Deformed surfaces from the overlap of objects and resting gel (Si & Yuan, RA-L 2022, III).
+    """Deformed surfaces from the overlap of objects and resting gel.
 
-    With u = rest − underside of the object (its overlap with the gel at rest) and u⁺ = max(u, 0): start from w = u⁺; for every width
-    of the pyramid, wide to narrow, w ← Gaussian(w), then the contact is re-imposed; last, one narrow Gaussian everywhere. The surface
-    is rest − w. The ``contact_rule`` says how the contact is re-imposed:
+    With u = rest − underside of the object (its overlap with the gel at rest) and u⁺ = max(u, 0): start from w = u⁺; for every step of a
+    pyramid, w ← gain · Gaussian(w), then the contact is re-imposed; last, one narrow Gaussian everywhere. The surface is rest − w. The
+    ``contact_rule`` says what the steps are and how the contact is re-imposed:
 
-    - ``"unilateral"`` (default): w ← max(w, u⁺). The gel never reaches into the object and leaves it where the Gaussians keep it deeper;
-      the contact is where w = u, up to 10⁻⁵ of the deepest overlap (float32). Everything stays continuous.
-    - ``"threshold"``: Taxim's own, w = u⁺ on the full contact C = {u > 0.4 max u}, nothing elsewhere. It keeps every detail of a relief,
-      tears the surface along the border of C on steep walls (dots in the image) and lets the gel reach into the object outside C.
+    - ``"unilateral"`` (default): ``LAYER_STEPS`` in units of the gel's thickness, w ← max(w, u⁺). The gel never reaches into the object and
+      leaves it where the Gaussians keep it deeper; the contact is where w = u, up to 10⁻⁵ of the deepest overlap (float32). Rim and skirt
+      are about those of a linear elastic layer that is bonded at its back and touches without friction (docs/rigid-pad.md).
+    - ``"threshold"``: Taxim's own (Si & Yuan, RA-L 2022, III), ``PYRAMID_SIGMAS``, gains of 1, w = u⁺ on the full contact
+      C = {u > 0.4 max u}, nothing elsewhere. It keeps every detail of a relief, tears the surface along the border of C on steep walls
+      (dots in the image) and lets the gel reach into the object outside C.
 
     Taxim does this to absolute heights in pixels; here it is done to the displacement w and with widths in metres, so that the dome is
-    not smoothed, an untouched pad is exactly at rest, and the result does not depend on the grid. Borders are mirrored.
+    not smoothed, an untouched pad is exactly at rest, and the result does not depend on the grid. Borders are mirrored. No gain exceeds 1:
+    the gel moves by no more than the deepest overlap.
 
     ``surface`` takes and gives NumPy arrays. ``launch`` works on Warp arrays of the CPU or of CUDA, so that it can be recorded. An
     environment's result does not depend on the others, to the last bit.
@@ -68,10 +71,10 @@ class ElasticSurround:
         self,
         grid: PadGrid,
         *,
-        thickness: float = np.inf,
+        thickness: float,
         num_envs: int = 1,
         device: str = "cpu",
-        sigmas: tuple[float, ...] = PYRAMID_SIGMAS,
+        steps: tuple[tuple[float, float], ...] | None = None,
         final_sigma: float = FINAL_SIGMA,
         contact_rule: str = "unilateral",
         contact_scale: float = CONTACT_SCALE,
@@ -80,24 +83,30 @@ class ElasticSurround:
 
         Args:
             grid: nodes of the pad.
-            thickness: of its gel [m], beyond which it cannot be pressed.
+            thickness: of its gel [m], by which the layer's Gaussians are wide, and beyond which it cannot be pressed.
             num_envs: environments B that are computed together; ``surface`` takes any number, so many at a time.
-            sigmas: [m], wide to narrow; ``final_sigma`` [m], 0 for none.
+            steps: standard deviation [m] and gain of every Gaussian; None takes those of the rule.
+            final_sigma: [m], 0 for none.
             contact_rule: one of ``CONTACT_RULES``; ``contact_scale``: of the threshold, [0, 1).
 
-        Raises ``InputError`` for an unknown rule.
+        Raises ``InputError`` for an unknown rule, or a thickness that is not positive and finite.
         """
         check_known("contact_rule", contact_rule, CONTACT_RULES)
+        check_number("thickness", thickness, "(0, inf)", "m")
         start_warp()
         self.grid, self.device = grid, wp.get_device(device)
         self._lanes = _CPU_LANES if self.device.is_cpu else _CUDA_LANES
         self._scale = contact_scale if contact_rule == "threshold" else -1.0
         self._lowest, self._shallow = float(-thickness - _FACE), float(thickness + grid.rest.min())
         finest = _FINEST * min(grid.pitch)
-        widths = [sigma for sigma in sigmas if sigma > finest] or [0.0]
-        self._pyramid = [_Gaussian(grid, sigma, self._lanes, self.device) for sigma in widths]
-        self._final = _Gaussian(grid, final_sigma, self._lanes, self.device) if final_sigma > finest else None
-        spread = np.cumsum(np.square([*widths, final_sigma]))
+        if steps is None and contact_rule == "threshold":
+            steps = tuple((sigma, 1.0) for sigma in PYRAMID_SIGMAS)
+        elif steps is None:
+            steps = tuple((share * thickness, gain) for share, gain in LAYER_STEPS)
+        steps = _resolved(steps, finest)
+        self._pyramid = [_Gaussian(grid, sigma, gain, self._lanes, self.device) for sigma, gain in steps]
+        self._final = _Gaussian(grid, final_sigma, 1.0, self._lanes, self.device) if final_sigma > finest else None
+        spread = np.cumsum(np.square([*(sigma for sigma, _ in steps), final_sigma]))
         self._reaches = [np.ceil(_REACH * np.sqrt(one) / grid.pitch).astype(int) + 2 for one in spread]
         """Nodes along x and y that each Gaussian, with those before, reaches."""
         self._allocate(num_envs)
@@ -218,16 +227,30 @@ class ElasticSurround:
         return wp.zeros(shape, dtype=dtype, device=self.device)
 
 
+def _resolved(steps: tuple[tuple[float, float], ...], finest: float) -> list[tuple[float, float]]:
+    """Steps whose Gaussians are wider than ``finest`` [m], at least one.
+
+    Of the others the gains count, in the step before: max(g max(w, u), u) = max(g w, u) for g <= 1.
+    """
+    wide: list[tuple[float, float]] = []
+    for sigma, gain in steps:
+        if sigma > finest:
+            wide.append((sigma, gain))
+        elif wide:
+            wide[-1] = wide[-1][0], wide[-1][1] * gain
+    return wide or [(0.0, 1.0)]
+
+
 class _Gaussian:
     """One Gaussian as products with matrices along both axes, on the device."""
 
-    def __init__(self, grid: PadGrid, sigma: float, lanes: int, device: Any) -> None:
-        """``sigma`` [m]; ``lanes``: nodes in a packet."""
+    def __init__(self, grid: PadGrid, sigma: float, gain: float, lanes: int, device: Any) -> None:
+        """``sigma`` [m]; ``gain``: sum of its weights; ``lanes``: nodes in a packet."""
         (ny, nx), (dx, dy) = grid.shape, grid.pitch
         (along_y, reach_y), (along_x, reach_x) = gaussian_matrix(ny, sigma / dy), gaussian_matrix(nx, sigma / dx)
         self.reach = np.array([reach_x, reach_y])
         """Nodes along x and y."""
-        down, self.down_band = _blocks(along_y, kernels.ROWS, device)
+        down, self.down_band = _blocks(gain * along_y, kernels.ROWS, device)
         self.down = wp.array(np.ascontiguousarray(down.transpose(1, 0, 2)), dtype=wp.vec4f, device=device)
         """Weights of ``ROWS`` rows in a vector, (blocks, Ny)."""
         across, self.across_band = _blocks(along_x, lanes, device)

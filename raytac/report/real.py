@@ -12,17 +12,20 @@ import numpy as np
 
 from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.fit_models import ALONE, MODES, Models, check_fit, fit_models, images_of, mode_times
-from raytac.calibrate.photographs import FAR, Photographs
+from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.presses import RealPresses, Split, by_half, by_press, shallow_to_deep
 from raytac.calibrate.ray_fit import FEWEST
+from raytac.checks import check_known
 from raytac.device import resolve_device
-from raytac.errors import BackendError, InputError
+from raytac.errors import InputError
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.io.progress import Progress
 from raytac.optics.trace.config import RayTraced
-from raytac.report.image_error import psnr, rmse, ssim_map
+from raytac.report.real_imprints import FITTED, check_imprints, imprint_metrics, imprint_scores, imprint_table
+from raytac.report.real_scores import noise_floor, press_scores, summary
 from raytac.specs import SensorSpec
+from raytac.specs.press import PADS
 
 SHOWN = 3
 """Presses on the image sheet: in true colour, with their noise, more make a large file."""
@@ -90,11 +93,17 @@ class RealSettings:
     rounds: int = 3
     shadows: bool = False
     """True lets the ray tracer cast shadows on the coat."""
+    imprints: tuple[str, ...] = (FITTED,)
+    """Imprints that the ray tracer is also shown of held-out presses, of ``real_imprints.IMPRINTS``."""
+    level: str = "medium"
+    """Mesh of the soft pad, one of ``PADS``."""
     device: str = "auto"
     seed: int = 0
 
     def __post_init__(self) -> None:
         check_fit(prior=self.prior, device=self.device, starts=self.starts, rounds=self.rounds)
+        check_imprints(self.imprints)
+        check_known("level", self.level, PADS)
         if self.tested is not None and not 1 <= self.tested <= self.folds:
             raise InputError("tested", value=self.tested, rule=f"must be 1 to {self.folds}, the number of folds")
 
@@ -128,6 +137,7 @@ def compare_real(
     metrics: dict[str, Metric] = {}
     priors: dict[str, list[str]] = {}
     starts: dict[str, list[tuple[float, ...]]] = {}
+    imprints: dict[str, list[dict[str, float]]] = {}
     images: dict[int, dict[str, np.ndarray]] = {}
     with result_folder(out) as folder:  # before the fits, so that a folder that cannot be written is refused at once
         with Progress(total=len(splits) + len(ablations), desc="fits") as bar:
@@ -141,10 +151,13 @@ def compare_real(
                         of = scores.setdefault(where + kind, {}).setdefault(mode, [])
                         of += press_scores(sensor, stack, shots.take(test))
                 if kind == "press":
+                    own = {"level": settings.level, "device": settings.device}
+                    for key, of in imprint_scores(models, sensor, shots.take(test), settings.imprints, **own).items():
+                        imprints.setdefault(key, []).extend(of)
                     images |= {int(k): {mode: stack[i] for mode, stack in seen.items()} for i, k in enumerate(test)}
                 if number == 0:
-                    own = shots.take(test)
-                    metrics |= {f"{mode}.ms": t for mode, t in mode_times(models, sensor, own, own.circles).items()}
+                    some = shots.take(test)
+                    metrics |= {f"{mode}.ms": t for mode, t in mode_times(models, sensor, some, some.circles).items()}
                     device = models.modes["raytrace"].device
                 bar.update()
             train, test = splits[0][1]
@@ -162,6 +175,7 @@ def compare_real(
             prefix = "" if kind == "press" else ("labelled." if kind == "labelled_press" else f"{kind}.")
             for mode, of in by_mode.items():
                 metrics |= {f"{prefix}{mode}.{key}": value for key, value in summary(of).items()}
+        metrics |= imprint_metrics(imprints)
         metrics |= {f"prior.{kind}": ", ".join(of) for kind, of in priors.items()}
         metrics |= {
             f"start_errors.{kind}_{k}": ", ".join(f"{error:.3f}" for error in errors)
@@ -178,6 +192,8 @@ def compare_real(
             "folds": settings.folds,
             "tested_folds": len(priors["press"]),
             "shadows": int(settings.shadows),
+            "imprints": ", ".join(settings.imprints),
+            "imprint_level": settings.level,
             "starts": settings.starts,
             "rounds": settings.rounds,
             "leds": len(sensor.lights.leds),
@@ -272,6 +288,7 @@ def table_text(metrics: Mapping[str, Metric], ablations: Sequence[str]) -> str:
             cells = [f"{cell(f'{prefix}{key}.contact_mae')} ({cell(f'{prefix}{key}.ring_mae')})" for prefix, _ in shown]
             lines.append(f"| {name} | {' | '.join(cells)} |")
         lines.append("")
+    lines += imprint_table(metrics)
     if ablations:
         lines += ["| ray tracer, first fold | contact MAE | ring MAE |", "|---|---|---|"]
         for name in ("nothing", *ablations):
@@ -302,49 +319,3 @@ def draw(real: np.ndarray, images: list[dict[str, np.ndarray]], circles: list[np
         for axis, name in zip(axes[0], columns, strict=True):
             axis.set_title(name)
         figure.savefig(path, dpi=110)
-
-
-BOX_MARGIN = 15
-"""Pixels that the box reaches beyond the labelled circle."""
-
-
-def press_scores(sensor: SensorSpec, images: np.ndarray, shots: Photographs) -> list[dict[str, float]]:
-    """Errors of ``images`` (N, H, W, 3) [levels] by press, at labelled circles.
-
-    MAE and RMSE [levels] in the disc, MAE in the ring from one to two radii, PSNR [dB] and SSIM in the box of the circle and
-    ``BOX_MARGIN`` px, MAE over the frame. SSIM is left out where scikit-image is not installed.
-    """
-    scores = []
-    height, width = shots.background.shape[:2]
-    for image, real, rho, (x, y, r) in zip(
-        images.astype(float), shots.presses.astype(float), shots.distance(sensor), shots.circles, strict=True
-    ):
-        off = np.abs(image - real)
-        x_low, x_high = (int(np.clip(e, 0, width)) for e in (x - r - BOX_MARGIN, x + r + BOX_MARGIN + 1))
-        top, bottom = (int(np.clip(e, 0, height)) for e in (y - r - BOX_MARGIN, y + r + BOX_MARGIN + 1))
-        box = np.s_[top:bottom, x_low:x_high]
-        score = {
-            "contact_mae": float(off[rho < 1].mean()),
-            "contact_rmse": float(np.sqrt((off[rho < 1] ** 2).mean())),
-            "ring_mae": float(off[(rho >= 1) & (rho < 2)].mean()),
-            "box_psnr": psnr(rmse(image[box], real[box])),
-            "frame_mae": float(off.mean()),
-        }
-        try:
-            ssim = ssim_map(np.clip(image, 0, 255).astype(np.uint8), real.astype(np.uint8))
-            score["box_ssim"] = float(np.nanmean(ssim[box]))
-        except BackendError:
-            pass
-        scores.append(score)
-    return scores
-
-
-def summary(scores: list[dict[str, float]]) -> dict[str, float]:
-    """Means over presses."""
-    return {key: float(np.mean([score[key] for score in scores])) for key in scores[0]}
-
-
-def noise_floor(sensor: SensorSpec, shots: Photographs) -> float:
-    """Mean absolute difference [levels] of photographs from the background, beyond ``FAR``."""
-    far = shots.distance(sensor) > FAR
-    return float(np.abs(shots.presses - shots.background)[far].mean())

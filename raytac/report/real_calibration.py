@@ -24,7 +24,7 @@ from raytac.optics.taxim.folder import CALIBRATION_FILES, save_calibration
 from raytac.optics.taxim.mode import TaximMode
 from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.tracer import Tracer
-from raytac.report.real import press_scores, summary
+from raytac.report.real_scores import press_scores, summary
 from raytac.specs import SensorSpec
 from raytac.specs.sensor import OpticsSpec
 from raytac.specs.sensor_file import lights_text, sensor_files

@@ -10,7 +10,7 @@ import pytest
 
 from raytac.errors import InputError
 from raytac.gel import pyramid
-from raytac.gel.gaussian import CONTACT_SCALE, FINAL_SIGMA, PYRAMID_SIGMAS, gaussian_matrix
+from raytac.gel.gaussian import CONTACT_SCALE, FINAL_SIGMA, LAYER_STEPS, PYRAMID_SIGMAS, gaussian_matrix
 from raytac.gel.pyramid import ElasticSurround
 from raytac.gel.surface import GelSurface, PadGrid, make_grid, rest_height
 from raytac.shapes.part import primitive
@@ -31,7 +31,7 @@ def press_sphere(
     grid = make_grid(PAD, pitch)
     pose = np.eye(4)[None].copy()
     pose[0, :3, 3] = *at, radius - depth
-    surround = ElasticSurround(grid, contact_rule=rule)
+    surround = ElasticSurround(grid, thickness=PAD.thickness, contact_rule=rule)
     return surround.surface(object_height([primitive("sphere", (radius,))], pose, grid.x, grid.y), pose)
 
 
@@ -53,9 +53,10 @@ def pyramid_by_definition(grid: PadGrid, under: np.ndarray, rule: str, final: fl
         along_y, along_x = (gaussian_by_cosines(n, sigma / d) for n, d in zip(grid.shape, reversed(grid.pitch), strict=True))
         return along_y @ field @ along_x.T
 
-    for sigma in PYRAMID_SIGMAS:
-        if sigma > finest:
-            w = smooth(w, sigma)
+    taxim, layer = [(sigma, 1.0) for sigma in PYRAMID_SIGMAS], [(share * PAD.thickness, gain) for share, gain in LAYER_STEPS]
+    for sigma, gain in layer if rule == "unilateral" else taxim:
+        if rule == "unilateral" or sigma > finest:
+            w = gain * smooth(w, sigma if sigma > finest else 0.0)
             w = np.maximum(w, u) if rule == "unilateral" else np.where(full, u, w)
     contact = (u > 0.0) & (w <= u + 1e-5 * u.max()) if rule == "unilateral" else full
     return grid.rest - (smooth(w, final) if final > finest else w), contact
@@ -115,7 +116,7 @@ def test_surfaces_are_those_of_the_definition(pitch: float, rule: str) -> None:
     heights[3] = object_height([primitive("box", (2e-3, 3e-3, 1e-3))], poses[3:], grid.x, grid.y)[0]
     heights = np.concatenate([heights, np.full((1, *grid.shape), -0.2e-3)])
     final = 2.0 * FINAL_SIGMA
-    surface = ElasticSurround(grid, contact_rule=rule, final_sigma=final, num_envs=2).surface(heights)
+    surface = ElasticSurround(grid, thickness=PAD.thickness, contact_rule=rule, final_sigma=final, num_envs=2).surface(heights)
     for b, under in enumerate(heights):
         height, contact = pyramid_by_definition(grid, under, rule, final)
         np.testing.assert_allclose(surface.height[b], height, rtol=0.0, atol=2e-9)
@@ -127,7 +128,7 @@ def test_surfaces_are_those_of_the_definition(pitch: float, rule: str) -> None:
 
 def test_no_contact_is_exactly_rest() -> None:
     grid = make_grid(PAD, 0.2e-3)
-    surface = ElasticSurround(grid).surface(np.full((2, *grid.shape), np.inf))
+    surface = ElasticSurround(grid, thickness=PAD.thickness).surface(np.full((2, *grid.shape), np.inf))
     np.testing.assert_array_equal(surface.height, np.broadcast_to(grid.rest.astype(np.float32), surface.height.shape))
     assert not surface.contact.any() and np.isnan(surface.contact_centre).all()
     assert np.array_equal(press_sphere(0.2e-3, depth=-1e-6).height[0], grid.rest.astype(np.float32))
@@ -138,7 +139,7 @@ def test_gel_never_reaches_into_the_object() -> None:
     grid = make_grid(PAD, 0.1e-3)
     sphere = radius - depth - np.sqrt(np.maximum(radius**2 - grid.x[None, :] ** 2 - grid.y[:, None] ** 2, 0.0))
     sphere = np.where(np.hypot(grid.x[None, :], grid.y[:, None]) < radius, sphere, np.inf)
-    surface = ElasticSurround(grid, final_sigma=0.0).surface(sphere[None])
+    surface = ElasticSurround(grid, thickness=PAD.thickness, final_sigma=0.0).surface(sphere[None])
     gap = sphere - surface.height[0].astype(float)
     contact = surface.contact[0]
     assert gap.min() > -1e-9, f"the gel reaches {-gap.min():.2e} m into the sphere"
@@ -156,7 +157,7 @@ def test_flat_punch_on_a_flat_pad_is_all_contact(depth: float) -> None:
     grid = make_grid(dataclasses.replace(PAD, dome_radius=(math.inf, math.inf)), 0.1e-3)
     off_axis = np.hypot(grid.x[None, :] - 1e-3, grid.y[:, None] + 0.5e-3)
     punch = off_axis <= 4e-3
-    surface = ElasticSurround(grid).surface(np.where(punch, -depth, np.inf)[None])
+    surface = ElasticSurround(grid, thickness=PAD.thickness).surface(np.where(punch, -depth, np.inf)[None])
     np.testing.assert_array_equal(surface.contact[0], punch)
     np.testing.assert_allclose(surface.contact_centre[0], (1e-3, -0.5e-3), atol=0.02e-3)
 
@@ -164,7 +165,7 @@ def test_flat_punch_on_a_flat_pad_is_all_contact(depth: float) -> None:
 @pytest.mark.parametrize("depth", [1e-40, 1e-12, 0.7e-3])
 def test_a_slab_over_the_whole_pad_has_a_centre(depth: float) -> None:
     grid = make_grid(dataclasses.replace(PAD, dome_radius=(math.inf, math.inf)), 0.2e-3)
-    surface = ElasticSurround(grid).surface(np.full((1, *grid.shape), -depth))
+    surface = ElasticSurround(grid, thickness=PAD.thickness).surface(np.full((1, *grid.shape), -depth))
     assert surface.contact.all()
     np.testing.assert_allclose(surface.contact_centre[0], 0.0, atol=1e-9)
 
@@ -174,7 +175,7 @@ def test_without_gaussians_the_surface_is_the_objects(final: float) -> None:
     """Or with the last one alone; the contact is the overlap."""
     grid = make_grid(PAD, 0.25e-3)
     under = object_height([primitive("sphere", (4e-3,))], np.eye(4)[None], grid.x, grid.y) + 3.4e-3
-    surface = ElasticSurround(grid, sigmas=(), final_sigma=final).surface(under)
+    surface = ElasticSurround(grid, thickness=PAD.thickness, steps=(), final_sigma=final).surface(under)
     overlap = np.maximum(grid.rest - under[0], 0.0)
     along_y, along_x = (gaussian_by_cosines(n, final / d) for n, d in zip(grid.shape, reversed(grid.pitch), strict=True))
     np.testing.assert_allclose(surface.indentation[0], along_y @ overlap @ along_x.T, rtol=0.0, atol=2e-9)
@@ -183,7 +184,7 @@ def test_without_gaussians_the_surface_is_the_objects(final: float) -> None:
 
 def test_unknown_contact_rule_is_refused() -> None:
     with pytest.raises(InputError, match="unilateral"):
-        ElasticSurround(make_grid(PAD, 0.5e-3), contact_rule="hard")
+        ElasticSurround(make_grid(PAD, 0.5e-3), thickness=PAD.thickness, contact_rule="hard")
 
 
 def test_threshold_rule_follows_the_object_and_the_surround_is_smooth() -> None:
@@ -194,7 +195,7 @@ def test_threshold_rule_follows_the_object_and_the_surround_is_smooth() -> None:
     overlap = grid.rest - sphere
     expected = (overlap > CONTACT_SCALE * overlap.max()) & (np.hypot(grid.x[None, :], grid.y[:, None]) < radius)
     np.testing.assert_array_equal(surface.contact[0], expected)
-    unsmoothed = ElasticSurround(grid, final_sigma=0.0, contact_rule="threshold").surface(sphere[None].astype(float))
+    unsmoothed = ElasticSurround(grid, thickness=PAD.thickness, final_sigma=0.0, contact_rule="threshold").surface(sphere[None].astype(float))
     np.testing.assert_allclose(unsmoothed.height[0][expected], sphere[expected], atol=1e-9)
     deep = overlap > 0.55 * overlap.max()
     # The last smoothing lifts a paraboloid of curvature 1/R by σ²/R.
@@ -235,7 +236,7 @@ def test_batch_equals_single_bit_for_bit_and_nan_stays_alone(pitch: float, devic
     poses[:, :2, 3] = [(0.0, 0.0), (1e-3, 0.0), (0.0, 0.0), (6e-3, 4e-3), (8e-3, -6e-3)]
     poses[:, 2, 3] = 3.5e-3, 3.2e-3, np.nan, 5.0e-3, 3.5e-3
     heights = object_height([primitive("sphere", (4e-3,))], poses, grid.x, grid.y)
-    single, batch = (ElasticSurround(grid, num_envs=count, device=device) for count in (1, 3))
+    single, batch = (ElasticSurround(grid, thickness=PAD.thickness, num_envs=count, device=device) for count in (1, 3))
     together = batch.surface(heights, poses)
     for b in range(5):
         alone = single.surface(heights[b : b + 1])
@@ -255,5 +256,5 @@ def test_a_gel_below_its_bonded_face_is_marked_in_its_environment_alone() -> Non
     np.testing.assert_array_equal(np.isnan(surface.height).all(axis=(1, 2)), [False, True, False])
     np.testing.assert_array_equal(surface.contact.any(axis=(1, 2)), [True, False, True])
     np.testing.assert_array_equal(np.isnan(surface.contact_centre[:, 0]), [False, True, False])
-    deep = ElasticSurround(grid, num_envs=3).surface(under)
+    deep = ElasticSurround(grid, thickness=PAD.thickness + 3e-4, num_envs=3).surface(under)
     assert np.isfinite(deep.height).all() and deep.height[1].min() < -PAD.thickness

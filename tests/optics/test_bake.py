@@ -40,7 +40,7 @@ def ball(at: Calibration, radius: float, depth: float, surround: bool = True) ->
     """A ball ``depth`` [m] deep into the middle of the pad."""
     place = np.eye(4)
     place[2, 3] = radius - depth
-    return pressed(at.grid, [primitive("sphere", (radius,), place)], ElasticSurround(at.grid) if surround else None)
+    return pressed(at.grid, [primitive("sphere", (radius,), place)], ElasticSurround(at.grid, thickness=at.sensor.gelpad.thickness) if surround else None)
 
 
 def errors(baked: Baked, surfaces: dict[str, GelSurface]) -> dict[str, dict[str, SceneError]]:
@@ -73,7 +73,7 @@ def test_touched_gel_and_that_around_have_sheets_of_their_own() -> None:
     surfaces = {f"{k}": ball(at, *size) for k, size in enumerate(((2e-3, 0.6e-3), (4e-3, 0.9e-3)))}
     two, together = (errors(replace(both, table=table), surfaces)["taxim"] for table in (both.table, one))
     for name in surfaces:
-        assert two[name].contact_mae < 0.8 * together[name].contact_mae, (two[name].contact_mae, together[name].contact_mae)
+        assert two[name].contact_mae < 0.9 * together[name].contact_mae, (two[name].contact_mae, together[name].contact_mae)
 
 
 def test_the_same_seed_gives_the_same_table(baked: Baked, calibration: Calibration) -> None:

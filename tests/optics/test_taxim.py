@@ -175,7 +175,7 @@ def test_the_gels_pyramid_with_upstreams_rule_is_upstreams_deformation() -> None
     pitch = 1e-3 * PIXMM
     grid = PadGrid(x=np.arange(shape[1]) * pitch, y=np.arange(shape[0]) * pitch, rest=np.zeros(shape))
     under = -(ball - (ball.max() - 0.8 / PIXMM)) * pitch
-    surface = ElasticSurround(grid, contact_rule="threshold").surface(under[None])
+    surface = ElasticSurround(grid, thickness=4e-3, contact_rule="threshold").surface(under[None])
     deepest = 0.8 / PIXMM
     assert (surface.contact[0] != mask).mean() < 1e-3
     assert np.abs(surface.indentation[0] / pitch - lift).max() < 0.03 * deepest

@@ -24,8 +24,10 @@ from raytac.gel.surface import GelSurface, make_grid
 from raytac.io.images import write_png
 from raytac.optics import RayTraced
 from raytac.report.markers import run_calibrate_markers
-from raytac.report.real import RealSettings, noise_floor, press_scores, summary, table_text
+from raytac.report.real import RealSettings, table_text
 from raytac.report.real_calibration import run_calibrate_optics
+from raytac.report.real_imprints import imprint_metrics, imprint_table
+from raytac.report.real_scores import noise_floor, press_scores, summary
 from raytac.sensor import TactileSensor
 from raytac.specs import load_sensor
 
@@ -176,7 +178,7 @@ def test_calibrate_writes_a_sensor_that_needs_no_photograph(of_itself: tuple[Pat
 @pytest.mark.slow
 def test_compare_real_scores_every_mode(of_itself: tuple[Path, np.ndarray], tmp_path: Path) -> None:
     (data, _), out = of_itself, tmp_path / "out"
-    args = ["--folds", "3", "--tested", "1", "--no-regions", "--no-ablations"]
+    args = ["--folds", "3", "--tested", "1", "--no-regions", "--no-ablations", "--imprint", "fitted,rigid"]
     assert main(["compare-real", str(data), *ONE_ROUND, *args, "--out", str(out)]) == 0
     metrics = json.loads((out / "metrics.json").read_text("utf-8"))
     for mode in MODES:
@@ -186,6 +188,28 @@ def test_compare_real_scores_every_mode(of_itself: tuple[Path, np.ndarray], tmp_
     text = (out / "real.md").read_text("utf-8")
     assert f"| ray tracer, no photograph | {metrics['raytrace_alone.contact_mae']:.2f} |" in text
     assert (out / "real.png").stat().st_size > 10_000
+    # The images are of the profile that is fitted, at the depth of the circle; the other imprints are of other surfaces.
+    fitted, rigid = metrics["imprint.fitted.raytrace.contact_mae"], metrics["imprint.rigid.raytrace.contact_mae"]
+    assert fitted < 1.5 and fitted < rigid < metrics["background.contact_mae"]
+    assert (metrics["imprint.rigid.presses"], metrics["imprint.rigid.unreached"]) == (3, 0)
+    assert metrics["imprint.rigid.depth_mm"] > metrics["imprint.rigid.overlap_depth_mm"]
+    assert f"| {metrics['imprint.rigid.depth_mm']:.3f} | {rigid:.2f} |" in text
+
+
+def test_imprints_are_means_over_presses_that_reached_their_circle() -> None:
+    reached = {"reached": 1.0, "overlap_depth_mm": 0.6, "depth_mm": 0.9, "depth_over_overlap": 1.5}
+    scores = {
+        "rigid": [reached, {"reached": 0.0, "overlap_depth_mm": 2.0}],
+        "rigid.raytrace": [{"contact_mae": 3.0, "contact_rmse": 4.0, "ring_mae": 2.0, "frame_mae": 1.0}],
+        "ipc": [{"reached": 0.0, "overlap_depth_mm": 2.0}],
+        "ipc.raytrace": [],
+    }
+    metrics = imprint_metrics(scores)
+    assert (metrics["imprint.rigid.presses"], metrics["imprint.rigid.unreached"], metrics["imprint.ipc.unreached"]) == (2, 1, 1)
+    assert (metrics["imprint.rigid.depth_mm"], metrics["imprint.rigid.overlap_depth_mm"]) == (0.9, 0.6)
+    assert "imprint.ipc.raytrace.contact_mae" not in metrics
+    (_, _, row, _) = imprint_table(metrics)
+    assert "1 presses without" in row and row.endswith("| 0.900 | 3.00 | 4.00 | 2.00 | 1.00 |")
 
 
 def test_folds_test_every_press_once() -> None:
@@ -225,10 +249,15 @@ WRONG: dict[str, Any] = {
 """Values that a fit cannot use, and what must be said of them."""
 
 
-@pytest.mark.parametrize("name", [*WRONG, "tested"])
+@pytest.mark.parametrize("name", [*WRONG, "tested", "imprints", "level"])
 def test_a_comparison_of_unknown_settings_cannot_be_set_up(name: str) -> None:
-    value, said = WRONG.get(name, (6, "must be 1 to 5"))
-    with pytest.raises(InputError, match=name) as told:
+    own: dict[str, Any] = {
+        "tested": (6, "must be 1 to 5"),
+        "imprints": (("fitted", "soft"), "fitted, rigid, ipc"),
+        "level": ("finest", "coarse, medium, fine"),
+    }
+    value, said = (WRONG | own)[name]
+    with pytest.raises(InputError, match="imprint" if name == "imprints" else name) as told:
         RealSettings(**{name: value})
     assert said in str(told.value)
 

@@ -128,7 +128,7 @@ def test_foundation_traction_has_the_total_and_the_twist():
     from raytac.gel.pyramid import ElasticSurround
 
     grid = make_grid(GELPAD, 0.1e-3)
-    surface = ElasticSurround(grid).surface(ball(grid.x - 1e-3, grid.y, 0.5e-3)[None])
+    surface = ElasticSurround(grid, thickness=GELPAD.thickness).surface(ball(grid.x - 1e-3, grid.y, 0.5e-3)[None])
     force, twist = np.array([[0.3, -0.2, -2.0]]), np.array([1.5e-3])
     traction = foundation_traction(surface, force, twist)[0].astype(float) * cell_areas(grid)[..., None]
     assert np.allclose(traction.sum(axis=(0, 1)), force[0], rtol=1e-4)

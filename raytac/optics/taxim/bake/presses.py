@@ -64,7 +64,7 @@ def ball_presses(gelpad: GelpadSpec, grid: PadGrid, camera: Pinhole, settings: B
     beyond its equator, and its contact lies wholly in view.
     """
     points = even_sequence(5, np.random.default_rng(seed).uniform(size=5))
-    surround = ElasticSurround(grid)
+    surround = ElasticSurround(grid, thickness=gelpad.thickness)
     half = view_half(camera)
     (small, large), (shallow, deep) = settings.radius, settings.depth_range(gelpad.thickness)
     for _ in range(settings.images):
@@ -100,7 +100,7 @@ def pin_presses(gelpad: GelpadSpec, grid: PadGrid, camera: Pinhole, settings: Ba
     Radii (evenly in their logarithm) and places follow the even sequence; the pin lies wholly in view.
     """
     points = even_sequence(3, np.random.default_rng([seed, 1]).uniform(size=3))
-    surround = ElasticSurround(grid)
+    surround = ElasticSurround(grid, thickness=gelpad.thickness)
     half = view_half(camera)
     (thin, thick), (_, deep) = settings.pin_radius, settings.depth_range(gelpad.thickness)
     for k in range(settings.pins):

@@ -1,0 +1,55 @@
+"""Errors of images of ball presses against their photographs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from raytac.calibrate.photographs import FAR, Photographs
+from raytac.errors import BackendError
+from raytac.report.image_error import psnr, rmse, ssim_map
+from raytac.specs import SensorSpec
+
+BOX_MARGIN = 15
+"""Pixels that the box reaches beyond the labelled circle."""
+
+
+def press_scores(sensor: SensorSpec, images: np.ndarray, shots: Photographs) -> list[dict[str, float]]:
+    """Errors of ``images`` (N, H, W, 3) [levels] by press, at labelled circles.
+
+    MAE and RMSE [levels] in the disc, MAE in the ring from one to two radii, PSNR [dB] and SSIM in the box of the circle and
+    ``BOX_MARGIN`` px, MAE over the frame. SSIM is left out where scikit-image is not installed.
+    """
+    scores = []
+    height, width = shots.background.shape[:2]
+    for image, real, rho, (x, y, r) in zip(
+        images.astype(float), shots.presses.astype(float), shots.distance(sensor), shots.circles, strict=True
+    ):
+        off = np.abs(image - real)
+        x_low, x_high = (int(np.clip(e, 0, width)) for e in (x - r - BOX_MARGIN, x + r + BOX_MARGIN + 1))
+        top, bottom = (int(np.clip(e, 0, height)) for e in (y - r - BOX_MARGIN, y + r + BOX_MARGIN + 1))
+        box = np.s_[top:bottom, x_low:x_high]
+        score = {
+            "contact_mae": float(off[rho < 1].mean()),
+            "contact_rmse": float(np.sqrt((off[rho < 1] ** 2).mean())),
+            "ring_mae": float(off[(rho >= 1) & (rho < 2)].mean()),
+            "box_psnr": psnr(rmse(image[box], real[box])),
+            "frame_mae": float(off.mean()),
+        }
+        try:
+            ssim = ssim_map(np.clip(image, 0, 255).astype(np.uint8), real.astype(np.uint8))
+            score["box_ssim"] = float(np.nanmean(ssim[box]))
+        except BackendError:
+            pass
+        scores.append(score)
+    return scores
+
+
+def summary(scores: list[dict[str, float]]) -> dict[str, float]:
+    """Means over presses."""
+    return {key: float(np.mean([score[key] for score in scores])) for key in scores[0]}
+
+
+def noise_floor(sensor: SensorSpec, shots: Photographs) -> float:
+    """Mean absolute difference [levels] of photographs from the background, beyond ``FAR``."""
+    far = shots.distance(sensor) > FAR
+    return float(np.abs(shots.presses - shots.background)[far].mean())
