@@ -174,7 +174,11 @@ def test_a_reset_tests_a_pad_against_itself_once(monkeypatch):
         scene.reset([1], world_from_body={"cube": pose(position=(0.0, -0.3e-3, 0.0))})
     assert scene.pose("cube")[1, 0, 3] == pytest.approx(shifts[1], abs=1e-12)
     state = scene.save()
-    state.world.y[0, scene.world.layout.node_start[0] + MESH.coat_vertices[0]] += (0.0, 0.0, -20e-3)  # through the gel and out of its back
+    state.world.y[0, scene.world.layout.node_start[0] + MESH.coat_vertices[0]] += (
+        0.0,
+        0.0,
+        -20e-3,
+    )  # through the gel and out of its back
     with pytest.raises(ipc.OverlapError, match="'left'"):
         scene.restore(state)
 

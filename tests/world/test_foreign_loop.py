@@ -149,7 +149,7 @@ def test_soft_pads_are_refused_in_a_loop_that_steps_no_solver() -> None:
         for physics in ("ipc", Ipc()):
             with pytest.raises(InputError, match=r"physics = .*must be rigid.*TactileWorld.*choose from: rigid"):
                 make(model, outputs=(), physics=physics)
-        with pytest.raises(InputError, match="physics = .*ipv"):
+        with pytest.raises(InputError, match=r"physics = .*ipv"):
             make(model, outputs=(), physics="ipv")
         make(model, outputs=(), physics="rigid")
 
