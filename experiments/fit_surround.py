@@ -3,9 +3,10 @@
     python experiments/fit_surround.py --out runs/fit_surround
     python experiments/fit_surround.py --steps 0 --out runs/surround_error
 
-Balls, cylinders, cones and punches are pressed into a linear elastic layer bonded at its back, without friction (``tests/gel/layer_contact.py``),
-and into the surround, w ← max(gain · Gaussian(w), u). What is minimised is the RMS difference of slopes over the layer's RMS slope: its mean
-over the shapes, and their RMS by 0.3 of it so that none is left out. The sum of all widths is what the surround costs, and is bounded.
+Balls, cylinders, cones and punches are pressed into a linear elastic layer bonded at its back, without friction
+(``tests/gel/layer_contact.py``), and into the surround, w ← max(gain · Gaussian(w), u). The error of a shape is the RMS difference of
+slopes over the layer's RMS slope. What is minimised is the mean over shapes and 0.3 times their RMS, so that no shape is neglected. The sum
+of all widths is what the surround costs, and is bounded.
 With ``--steps 0`` nothing is fitted, and the errors are those of the code. Other shapes (``new.…``) were not fitted to.
 """
 
@@ -24,7 +25,10 @@ from tests.gel.layer_contact import Layer, Overlap, ball, cone, cylinder, punch,
 
 MM = 1e-3
 LARGE: dict[str, Overlap] = {
-    **{f"ball_{r}_{d}": ball(r * MM, d * MM) for r, d in ((1, 0.15), (1, 0.5), (2, 0.2), (2, 0.8), (3.155, 0.3), (3.155, 1.0), (5, 0.3), (5, 0.9))},
+    **{
+        f"ball_{r}_{d}": ball(r * MM, d * MM)
+        for r, d in ((1, 0.15), (1, 0.5), (2, 0.2), (2, 0.8), (3.155, 0.3), (3.155, 1.0), (5, 0.3), (5, 0.9))
+    },
     **{f"cylinder_{r}_{d}": cylinder(r * MM, h * MM, d * MM) for r, h, d in ((3, 3, 0.3), (2, 4, 0.7), (4, 3, 0.8))},
     "cone": cone(0.6, 0.6 * MM),
     "punch_1.2": punch(1.2 * MM, 0.3 * MM),

@@ -19,7 +19,7 @@ from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 
 _TOLERANCE = 0.004
-"""Share of a circle's radius within which the contact's must come: twice what a node more or less of the rim makes."""
+"""Tolerance of the contact's radius, over the circle's: twice the rounding to nodes."""
 _MOST_STAGES = 12
 _DEEPEST = 0.95
 """Share of the gel's thickness, or of the ball's radius, that a press may reach."""
@@ -40,7 +40,10 @@ class PressedBall:
 
 
 def overlap_depth(contact_radius: float, ball_radius: float) -> float:
-    """Depth R − √(R² − a²) at which a ball cuts a plane in a disc of radius a, in the unit of both."""
+    """Depth R − √(R² − a²) at which a ball cuts a plane in a disc of radius a.
+
+    It has the unit of both radii.
+    """
     return ball_radius - float(np.sqrt(ball_radius**2 - contact_radius**2))
 
 

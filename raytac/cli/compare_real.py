@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from raytac.cli.shared import FitOptions, named, print_paths
+from raytac.io.options import parse_names
 from raytac.physics.soft.availability import quiet_solver
 from raytac.specs.press import PADS
 
@@ -59,7 +60,7 @@ class CompareRealArgs(FitOptions):
             rounds=self.rounds,
             prior=self.chosen_prior,
             shadows=self.shadows,
-            imprints=tuple(self.imprint.split(",")),
+            imprints=parse_names(self.imprint, "imprint"),
             level=self.imprint_level,
             device=self.device,
             seed=self.seed,

@@ -18,7 +18,7 @@ LAYER_STEPS = (
     (0.0192, 0.9561),
     (0.0118, 0.9640),
 )
-"""Standard deviation over the gel's thickness, and gain, of each Gaussian of an elastic layer.
+"""Standard deviation over the gel's thickness, and gain, of each Gaussian of a layer.
 
 Fitted to contacts of a linear elastic layer bonded at its back (``experiments/fit_surround.py``)."""
 FINAL_SIGMA = 1.1 * _TAXIM_PIXEL

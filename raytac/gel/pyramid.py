@@ -1,4 +1,4 @@
-"""The gel around a contact: Gaussians with the contact re-imposed, as of an elastic layer or of Taxim."""
+"""The gel around a contact: an elastic layer's Gaussians, or Taxim's pyramid."""
 
 from __future__ import annotations
 
@@ -103,10 +103,10 @@ class ElasticSurround:
             steps = tuple((sigma, 1.0) for sigma in PYRAMID_SIGMAS)
         elif steps is None:
             steps = tuple((share * thickness, gain) for share, gain in LAYER_STEPS)
-        steps = _resolved(steps, finest)
-        self._pyramid = [_Gaussian(grid, sigma, gain, self._lanes, self.device) for sigma, gain in steps]
+        resolved = _resolved(steps or (), finest)
+        self._pyramid = [_Gaussian(grid, sigma, gain, self._lanes, self.device) for sigma, gain in resolved]
         self._final = _Gaussian(grid, final_sigma, 1.0, self._lanes, self.device) if final_sigma > finest else None
-        spread = np.cumsum(np.square([*(sigma for sigma, _ in steps), final_sigma]))
+        spread = np.cumsum(np.square([*(sigma for sigma, _ in resolved), final_sigma]))
         self._reaches = [np.ceil(_REACH * np.sqrt(one) / grid.pitch).astype(int) + 2 for one in spread]
         """Nodes along x and y that each Gaussian, with those before, reaches."""
         self._allocate(num_envs)

@@ -94,7 +94,7 @@ class RealSettings:
     shadows: bool = False
     """True lets the ray tracer cast shadows on the coat."""
     imprints: tuple[str, ...] = (FITTED,)
-    """Imprints that the ray tracer is also shown of held-out presses, of ``real_imprints.IMPRINTS``."""
+    """Imprints of held-out presses under the ray tracer, of ``real_imprints.IMPRINTS``."""
     level: str = "medium"
     """Mesh of the soft pad, one of ``PADS``."""
     device: str = "auto"

@@ -1,4 +1,4 @@
-"""Imprints that physics gives for the balls of a comparison with photographs, seen by its ray tracer."""
+"""Imprints of balls by the physics of pads, under a fitted ray tracer, against photographs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ AT_OVERLAP = "overlap"
 _MODE = "raytrace"
 
 Scores = dict[str, list[dict[str, float]]]
-"""Errors of presses, and depths, by key of ``metrics.json`` between ``imprint.`` and the measure."""
+"""Errors and depths by press; names are those between ``imprint.`` and the measure."""
 
 
 def check_imprints(names: Sequence[str]) -> tuple[str, ...]:
@@ -35,7 +35,7 @@ def check_imprints(names: Sequence[str]) -> tuple[str, ...]:
 def imprint_scores(
     models: Models, sensor: SensorSpec, shots: Photographs, names: Sequence[str], *, level: str, device: str
 ) -> Scores:
-    """Errors of the fitted ray tracer on every imprint of ``names``, of presses that were not fitted.
+    """Errors of the fitted ray tracer by imprint, of presses that were not fitted.
 
     A circle has its centre as refined by ``models`` and its radius as labelled. That is all that the imprint is told of a press.
     """

@@ -80,7 +80,7 @@ class Layer:
 
     def filtered(self, gain: np.ndarray, field: np.ndarray) -> np.ndarray:
         """Fields (..., n, n) with every wave multiplied by its gain (n, n/2 + 1)."""
-        return irfft2(gain * rfft2(field), s=field.shape[-2:])
+        return np.asarray(irfft2(gain * np.asarray(rfft2(field)), s=field.shape[-2:]))
 
     def overlap(self, of: Overlap) -> np.ndarray:
         """Overlap at the nodes, (n, n)."""

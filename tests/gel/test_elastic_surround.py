@@ -1,4 +1,4 @@
-"""Rim and skirt of the surround against the elastic layer: an independent solution, itself checked by Lebedev and Ufliand's; the soft pad."""
+"""Rim and skirt of the surround against an independent solution of the elastic layer (itself checked by its force) and the soft pad."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_rim_and_skirt_are_those_of_the_elastic_layer(name: str) -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(0.5e-3, 0.15e-3), (0.5e-3, 0.4e-3), (1e-3, 0.4e-3)])
 def test_gel_rises_into_a_groove_as_the_layer_does(width: float, height: float) -> None:
-    """A flat punch of 8 mm with a ring-shaped groove of 4 mm, no shape that the Gaussians were fitted to; Taxim's rise by a third or less."""
+    """A flat punch of 8 mm with a ring-shaped groove of 4 mm: no such shape was fitted to."""
     depth = 0.4e-3
 
     def overlap(x: np.ndarray, y: np.ndarray) -> np.ndarray:

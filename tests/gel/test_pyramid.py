@@ -195,7 +195,9 @@ def test_threshold_rule_follows_the_object_and_the_surround_is_smooth() -> None:
     overlap = grid.rest - sphere
     expected = (overlap > CONTACT_SCALE * overlap.max()) & (np.hypot(grid.x[None, :], grid.y[:, None]) < radius)
     np.testing.assert_array_equal(surface.contact[0], expected)
-    unsmoothed = ElasticSurround(grid, thickness=PAD.thickness, final_sigma=0.0, contact_rule="threshold").surface(sphere[None].astype(float))
+    unsmoothed = ElasticSurround(grid, thickness=PAD.thickness, final_sigma=0.0, contact_rule="threshold").surface(
+        sphere[None].astype(float)
+    )
     np.testing.assert_allclose(unsmoothed.height[0][expected], sphere[expected], atol=1e-9)
     deep = overlap > 0.55 * overlap.max()
     # The last smoothing lifts a paraboloid of curvature 1/R by σ²/R.

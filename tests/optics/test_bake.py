@@ -40,7 +40,8 @@ def ball(at: Calibration, radius: float, depth: float, surround: bool = True) ->
     """A ball ``depth`` [m] deep into the middle of the pad."""
     place = np.eye(4)
     place[2, 3] = radius - depth
-    return pressed(at.grid, [primitive("sphere", (radius,), place)], ElasticSurround(at.grid, thickness=at.sensor.gelpad.thickness) if surround else None)
+    gel = ElasticSurround(at.grid, thickness=at.sensor.gelpad.thickness) if surround else None
+    return pressed(at.grid, [primitive("sphere", (radius,), place)], gel)
 
 
 def errors(baked: Baked, surfaces: dict[str, GelSurface]) -> dict[str, dict[str, SceneError]]:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError, SpecError
+from raytac.gel import pyramid
 from raytac.gel.gaussian import PYRAMID_SIGMAS
-from raytac.gel.pyramid import ElasticSurround
 from raytac.gel.traction import cell_areas
 from raytac.physics.rigid.pad import RigidPad
 from raytac.sensor import TactileSensor
@@ -96,21 +96,20 @@ def test_one_environment_of_a_batch_is_named() -> None:
         list(pad_of(scene, num_envs=2, offsets=at).run())
 
 
-def test_gel_that_would_lie_below_the_bonded_face_fails_its_environment_alone() -> None:
+def test_gel_that_would_lie_below_the_bonded_face_fails_its_environment_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """A plate wider than the pad, under Gaussians without loss (Taxim's): mirrored at the borders, they lift its displacement there."""
     scene = scene_of(StageSpec("indent", depth=1e-3), StageSpec("release"), length=40e-3, width=40e-3, height=5e-3)
     depths = np.array([2.0, 3.99, 3.0]) * 1e-3
     pad = pad_of(scene, num_envs=3, depths=depths)
     assert not any(state.failed.any() for state in pad.run())  # the layer's own gains hold it at the plate
-    lossless = {"thickness": MINI.gelpad.thickness, "steps": tuple((sigma, 1.0) for sigma in PYRAMID_SIGMAS)}
-    pad._surround = ElasticSurround(pad.grid, **lossless)
+    monkeypatch.setattr(pyramid, "LAYER_STEPS", tuple((sigma / MINI.gelpad.thickness, 1.0) for sigma in PYRAMID_SIGMAS))
+    pad = pad_of(scene, num_envs=3, depths=depths)
     start, pressed, released = pad.run()
     assert not start.failed.any()
     for state in (pressed, released):
         assert state.failed.tolist() == [False, True, False] and np.isnan(state.normal_force[1])
         assert np.isnan(state.surface.height[1]).all() and not state.surface.contact[1].any()
     alone = pad_of(scene, depths=depths[:1])
-    alone._surround = ElasticSurround(alone.grid, **lossless)
     np.testing.assert_array_equal(pressed.surface.height[0], list(alone.run())[1].surface.height[0])
 
 
