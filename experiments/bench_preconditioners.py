@@ -25,7 +25,7 @@ import warp as wp
 from bench_ipc_scenes import CELLS, D_HAT, DT, FRICTION, GAP, MATERIAL, PRESS, RADIUS, TRAVEL, ball_surface, press_pad
 
 import ipc
-from ipc.solver import linear
+from ipc.solver import block_jacobi, linear
 from ipc.solver.preconditioners import RestInverse
 from raytac.errors import RaytacError
 from raytac.io import VERSIONED, CommonOptions, Metric, result_folder, versions, write_metrics
@@ -107,8 +107,8 @@ class Fsai:
         from warp.optim.linear import FSAI
 
         self.contact.zero_()
-        inputs, dim = [system, contacts, active, self.lanes], (self.batch, self.lanes)
-        wp.launch(linear.diagonal_rows, dim=dim, inputs=inputs, outputs=[self.contact], device=self.device)
+        inputs, dim = [system, contacts, False, active, self.lanes], (self.batch, self.lanes)
+        wp.launch(block_jacobi.diagonal_rows, dim=dim, inputs=inputs, outputs=[self.contact], device=self.device)
         inputs = [system, self.contact, self.row_start, self.blocks, self.matrix.values]
         wp.launch(fill_blocks, dim=self.contact.shape, inputs=inputs, device=self.device)
         if self.factor is None:

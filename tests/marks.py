@@ -54,6 +54,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "ipc",
         "markers",
         "observe/test_observer.py",
+        "gel/test_elastic_surround.py",
         "gel/test_pyramid.py",
         "physics/rigid/test_pad_search.py",
         "physics/rigid/test_pierced.py",

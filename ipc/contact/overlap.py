@@ -226,7 +226,7 @@ def _find_pair_overlap(layout: Layout, a: int, b: int, x: Floats, normal: Floats
 
 
 class OverlapCheck:
-    """Refusal of states in which surfaces cross; pairs that were once apart are not tested again.
+    """Refusal of states in which surfaces cross; no pair is tested again once it was apart.
 
     A body alone is known by the shape of its own surface, wherever its frame is; two bodies by their shapes and frames.
     """

@@ -169,7 +169,7 @@ class RestState:
         pot.launch(distance, pot.y.shape, inputs, [pot.node_change])
         self._distance.zero_()
         pot.reduce(pot.node_change, mask, MAX, self._distance)
-        return np.array(self._distance.numpy())
+        return np.array(self._distance.numpy(), dtype=np.float64)
 
     def carry(self, envs: NDArray[np.bool_]) -> None:
         """Let a step to the goals pass in environments (B,) where nothing touches a bonded body."""

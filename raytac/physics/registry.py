@@ -30,7 +30,7 @@ def checked_physics(physics: str | PhysicsConfig | None) -> PhysicsConfig | None
 
 
 def rigid_physics(physics: str | PhysicsConfig | None) -> PhysicsConfig | None:
-    """As ``checked_physics``; ``InputError`` for soft pads, in a loop that does not step a solver."""
+    """As ``checked_physics``, for loops that step no solver; ``InputError`` for soft pads."""
     config = checked_physics(physics)
     if config is not None and config.is_simulated:
         rule = "must be rigid where somebody else steps MuJoCo: soft pads are stepped with the world, by TactileWorld with a task scene"

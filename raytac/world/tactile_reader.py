@@ -150,7 +150,7 @@ class TactileReader:
     ) -> PadReading:
         """Reading of one sensor, a row for each of ``envs`` (None: all states)."""
         rows = np.arange(len(states)) if envs is None else np.asarray(envs)
-        datas, failed = [states[b] for b in rows], self.failed[rows]
+        datas, failed = [states[b] for b in rows.tolist()], self.failed[rows]
         world_from_pad = site_poses(datas, int(self.model.site(mounted.site).id))
         pad_from_body = inverse(world_from_pad)[:, None] @ body_poses(datas, self._body_index)
         wrench, load = self._forces(mounted, datas, world_from_pad)

@@ -421,7 +421,7 @@ class SoftScene:
         return Poses(pads, self._now.bodies | self._registry.named(driven or {}))
 
     def _placed(self, pads: np.ndarray, bodies: Mapping[str, np.ndarray], mask: np.ndarray) -> ipc.State:
-        """The present state, but for the environments of the mask: undeformed and at rest at these poses."""
+        """The present state; environments of the mask undeformed and at rest at these poses."""
         state, start, layout = self.world.save(), self._start_state, self.world.layout
         for name in ("y", "velocity", "frame_rotation", "frame_position", "kappa", "failed"):
             getattr(state, name)[mask] = getattr(start, name)[mask]
