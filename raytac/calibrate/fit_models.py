@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from raytac.calibrate.direct_fit import SIGMA, FitSettings
+from raytac.calibrate.drift import Drift, Settled, measured_drift, no_drift, settled
 from raytac.calibrate.image_fits import fit_mlp, fit_table, press_samples, with_cast_shadows, with_shading
 from raytac.calibrate.imprint import press_surface
 from raytac.calibrate.photographs import Photographs
@@ -41,8 +42,10 @@ class Models:
     """Fits to one set of presses: the lights with imprint and circles, and a mode of each kind."""
 
     fitted: Fitted
-    rest: np.ndarray
-    """The image at rest of all modes [levels], (H, W, 3)."""
+    settled: Settled
+    """The fitted photographs with the image at rest of all modes, without session drift."""
+    drifts: bool
+    """True if session drift is part of the model."""
     prior: str
     """Name of the strength of priors (``STRENGTHS``)."""
     modes: dict[str, OpticalMode]
@@ -50,9 +53,18 @@ class Models:
     tracing: RayTraced
     """Configuration of the ray tracer."""
 
+    @property
+    def rest(self) -> np.ndarray:
+        """The image at rest of all modes [levels], (H, W, 3)."""
+        return self.settled.shots.background
+
+    def drift(self, shots: Photographs) -> Drift:
+        """Session drift of presses that were not fitted, from their pixels far from a contact."""
+        return measured_drift(self.fitted.sensor, shots, self.rest) if self.drifts else no_drift(len(shots.presses))
+
     def circles(self, shots: Photographs) -> np.ndarray:
         """Circles (N, 3) [px] of presses that were not fitted, from labels and fitted lights."""
-        own = dataclasses.replace(shots, background=self.rest)
+        own = dataclasses.replace(shots, background=self.rest, presses=self.drift(shots).removed(shots.presses))
         return refine_circles(self.fitted.sensor, own, self.fitted.state, device=self.device, tracing=self.tracing)
 
 
@@ -99,6 +111,7 @@ def fit_models(
     starts: int = 3,
     rounds: int = 3,
     settle: bool = True,
+    drift: bool = True,
     prior: str | None = None,
     shadow_table: str = SHADOW_TABLES[0],
     tracing: RayTraced | None = None,
@@ -107,13 +120,20 @@ def fit_models(
     """Fit ``modes`` to the presses of ``shots``, with imprint and circles of the lights' fit.
 
     ``prior`` names one of ``STRENGTHS``; None chooses it within ``shots``. ``shadow_table``: one of ``SHADOW_TABLES``. ``settle``: all
-    modes have the image at rest of ``Photographs.settled``, and not the one photograph of it. Raises as ``check_fit`` and ``fit_lights``.
+    modes have the image at rest of ``drift.settled``, and not the one photograph of it. ``drift``: gain and offset of every photograph are
+    measured far from contacts and taken from it before the fit. Raises as ``check_fit`` and ``fit_lights``.
     """
     tracing = RayTraced() if tracing is None else tracing
     settings = FitSettings() if settings is None else settings
     own = {"device": device, "starts": starts, "rounds": rounds}
     check_fit(modes=modes, prior=prior, fixed=settings.fixed, shadow_table=shadow_table, **own)
-    shots = shots.settled(sensor) if settle else shots
+    if settle:
+        steady = settled(sensor, shots, drift=drift)
+    else:
+        own_drift = measured_drift(sensor, shots, shots.background) if drift else no_drift(len(shots.presses))
+        one = dataclasses.replace(shots, presses=own_drift.removed(shots.presses))
+        steady = Settled(one, own_drift, no_drift(1))
+    shots = steady.shots
     if prior is None:
         prior, _ = choose_strength(sensor, shots, settings, seed=seed, tick=tick)
     settings = dataclasses.replace(settings, **STRENGTHS[prior])
@@ -141,7 +161,7 @@ def fit_models(
             built[name] = Mlp(fit_mlp(sensor, background, samples, seed=seed)).build(sensor, device=device)
         else:
             built[name] = Phong(background=background.astype(np.uint8)).build(sensor, device=device)
-    return Models(fitted, background, prior, built, device, tracing)
+    return Models(fitted, steady, drift, prior, built, device, tracing)
 
 
 def images_of(mode: OpticalMode, sensor: SensorSpec, shots: Photographs, circles: np.ndarray, slopes: np.ndarray) -> np.ndarray:

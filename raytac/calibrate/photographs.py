@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from raytac.calibrate.presses import RealPresses, read_presses
+from raytac.calibrate.presses import RealPresses, in_image, read_presses
 from raytac.errors import InputError
 from raytac.specs.sensor import SensorSpec
 
@@ -29,18 +29,14 @@ class Photographs:
     radius: np.ndarray
     """Those of the balls [m], (N,)."""
 
+    @property
+    def fully_visible(self) -> np.ndarray:
+        """Mask (N,) of the circles that lie in the image."""
+        height, width = self.background.shape[:2]
+        return in_image(self.circles, (width, height))
+
     def take(self, index: np.ndarray) -> Photographs:
         return dataclasses.replace(self, presses=self.presses[index], circles=self.circles[index], radius=self.radius[index])
-
-    def settled(self, sensor: SensorSpec) -> Photographs:
-        """The same with another ``background``, in whole levels.
-
-        It is the mean of it and of the presses' pixels beyond ``FAR`` radii. One photograph of the sensor at rest holds that
-        photograph's noise, and was taken at another time than the presses were.
-        """
-        far = self.distance(sensor)[..., None] > FAR
-        total = self.background + np.where(far, self.presses, 0).sum(0)
-        return dataclasses.replace(self, background=np.rint(total / (1 + far.sum(0))))
 
     def shrunk(self, factor: int) -> Photographs:
         """Mean of every ``factor`` × ``factor`` pixels."""
@@ -70,12 +66,14 @@ def decode(levels: np.ndarray, gamma: float) -> np.ndarray:
 
 
 def photographs_of(presses: RealPresses, sensor: SensorSpec) -> Photographs:
-    """The fully visible presses at the sensor's resolution; InputError for none or other sizes."""
+    """Presses at the sensor's resolution; InputError for other sizes, or none that is fully visible.
+
+    Those at the border are among them, as ``Photographs.fully_visible`` says. All must have a circle.
+    """
     if presses.resolution != sensor.camera.resolution:
         rule = f"must have images of the sensor's size, {sensor.camera.resolution}"
         raise InputError("data", value=presses.resolution, rule=rule)
-    presses = presses.take(presses.fully_visible)
-    if not len(presses):
+    if not presses.fully_visible.any():
         raise InputError("data", value="0 presses", rule="must hold a press whose contact circle lies in the image")
     widest = presses.circles[:, 2] * sensor.camera.pixel_pitch[0] / presses.ball_radius
     if (widest >= 1).any():

@@ -54,9 +54,7 @@ class RealPresses:
     @property
     def fully_visible(self) -> np.ndarray:
         """Mask (N,) of the circles that lie in the image; False where the circle is unknown."""
-        width, height = self.resolution
-        x, y, r = self.circles.T
-        return (x - r >= 0) & (y - r >= 0) & (x + r <= width) & (y + r <= height)
+        return in_image(self.circles, self.resolution)
 
     def take(self, index: np.ndarray) -> RealPresses:
         """The presses at ``index``, whole numbers or a mask (N,)."""
@@ -72,6 +70,12 @@ class RealPresses:
     def with_circles(self, circles: np.ndarray) -> RealPresses:
         """The same presses with other circles (N, 3)."""
         return dataclasses.replace(self, circles=np.asarray(circles, dtype=float))
+
+
+def in_image(circles: np.ndarray, resolution: tuple[int, int]) -> np.ndarray:
+    """Mask (N,) of circles (N, 3) [px] that lie in an image of (width, height) whole."""
+    (width, height), (x, y, r) = resolution, circles.T
+    return (x - r >= 0) & (y - r >= 0) & (x + r <= width) & (y + r <= height)
 
 
 def read_presses(data: Path | str, *, ball_diameter: float | None = None) -> RealPresses:

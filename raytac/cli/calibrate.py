@@ -16,7 +16,20 @@ from raytac.report.markers import run_calibrate_markers
 from raytac.specs import load_sensor
 from raytac.specs.press import PADS
 
-_OF_DATA = ("model", "ball_diameter_mm", "sides", "split", "holdout", "shadows", "shadow_table", "starts", "rounds", "prior")
+_OF_DATA = (
+    "model",
+    "ball_diameter_mm",
+    "sides",
+    "split",
+    "holdout",
+    "shadows",
+    "shadow_table",
+    "starts",
+    "rounds",
+    "prior",
+    "border",
+    "drift",
+)
 _OF_MARKERS = ("level", "quick", "verbose")
 
 
@@ -95,6 +108,7 @@ class CalibrateArgs(FitOptions, SolverOptions):
             prior=self.chosen_prior,
             shadows=self.shadows,
             shadow_table=self.shadow_table,
+            drift=self.drift,
             device=self.device,
             seed=self.seed,
             start=start,

@@ -19,7 +19,8 @@ from raytac.specs.press import PADS
 class CompareRealArgs(FitOptions):
     """Fit ray tracer, table and network to real presses of balls, and test them on the others.
 
-    Phong's model is tested too. Writes real.md (tables), real.png (photographs, every mode, signed errors) and metrics.json. Without
+    Phong's model is tested too. Writes real.md (tables), real.png (photographs, every mode, signed errors), drift.csv and
+    metrics.json. Without
     --out the folder is runs/compare-real/SENSOR. An error or Ctrl-C leaves the folder as it was.
     """
 
@@ -60,6 +61,7 @@ class CompareRealArgs(FitOptions):
             rounds=self.rounds,
             prior=self.chosen_prior,
             shadows=self.shadows,
+            drift=self.drift,
             imprints=parse_names(self.imprint, "imprint"),
             level=self.imprint_level,
             device=self.device,

@@ -61,6 +61,8 @@ class PressArgs(ShadowOptions, SolverOptions):
     """raytrace: rays a pixel (fast: a square number) or samples; 1 and 256 if not given."""
     resolution: str | None = None
     """WIDTHxHEIGHT of the images [px], as in 320x240, up to 8192; the sensor's if not given."""
+    noise: bool = False
+    """Add the camera's grain to rgb.png, by the [noise] table of the sensor's file."""
     outputs: Annotated[str | None, named(OUTPUTS)] = None
     """Outputs to compute, joined by commas; all if not given. Only raytrace has layers."""
 
@@ -83,6 +85,7 @@ class PressArgs(ShadowOptions, SolverOptions):
             device=self.device,
             seed=self.seed,
             markers=self.markers,
+            noise=self.noise,
         )
         # Presses that differ in physics or optics do not replace each other.
         others = [name for name in (PHYSICS.name_of(physics), self.optics) if name not in ("rigid", "raytrace")]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
 from raytac.calibrate.circles import with_found_circles
@@ -44,13 +45,21 @@ def print_paths(paths: Iterable[Path]) -> int:
 
 
 def read_data(
-    data: Path, sensor_name: str, ball_diameter_mm: float | None, sides: str, split: int = 1, device: str = "auto"
-) -> tuple[SensorSpec, RealPresses, Photographs, list[str]]:
-    """The sensor, its fully visible presses as read and as floats, and names of doubtful ones.
+    data: Path,
+    sensor_name: str,
+    ball_diameter_mm: float | None,
+    sides: str,
+    split: int = 1,
+    device: str = "auto",
+    *,
+    border: bool = True,
+) -> tuple[SensorSpec, RealPresses, Photographs, dict[str, str]]:
+    """The sensor, its presses as read and as floats, and what to say of some, by name.
 
-    A press is doubtful if its circle was found in the image without a clear step of colour. ``sides`` as of ``leds_at_walls``, or
-    ``OWN_LEDS``, each of which then is ``split`` into so many. ``device``: where an exposure of ``AUTO`` is found, under the
-    sensor's own lights.
+    ``border``: with presses whose labelled circle leaves the image. One without a label is left out there, since circles are searched
+    for badly at the border. A press is doubtful if its circle was found in the image without a clear step of colour.
+    ``sides`` as of ``leds_at_walls``, or ``OWN_LEDS``, each of which then is ``split`` into so many. ``device``: where an
+    exposure of ``AUTO`` is found, under the sensor's own lights.
 
     Raises:
         SpecError, InputError, CalibrationError: as the readers say.
@@ -67,9 +76,16 @@ def read_data(
     elif split != 1:
         sensor = with_lights(sensor, leds_split(sensor, split))
     presses = read_presses(data, ball_diameter=None if ball_diameter_mm is None else ball_diameter_mm / 1e3)
+    labelled = ~np.isnan(presses.circles).any(axis=1)
     presses, doubtful = with_found_circles(presses, sensor.camera.pixel_pitch[0])
-    names = [name for name, bad in zip(presses.names, doubtful, strict=True) if bad]
-    return sensor, presses.take(presses.fully_visible), photographs_of(presses, sensor), names
+    used = presses.fully_visible | (labelled & border)
+    said = {name: "the circle is doubtful" for name, bad in zip(presses.names, doubtful & used, strict=True) if bad}
+    why = "it is not fully visible" + (", and its circle is not labelled" if border else "")
+    said |= {name: f"not used: {why}" for name, is_used in zip(presses.names, used, strict=True) if not is_used}
+    presses = presses.take(used)
+    if not len(presses):
+        raise InputError("data", value="0 presses", rule="must hold a press whose contact circle lies in the image")
+    return sensor, presses, photographs_of(presses, sensor), said
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,16 +111,23 @@ class FitOptions(CommonOptions):
 
     Or `inner`, which chooses by cross-validation between halves of the pad within the presses that are fitted to."""
 
+    border: bool = True
+    """Also fit presses whose labelled circle leaves the image; they are tested apart."""
+    drift: bool = True
+    """Take session drift from every photograph: a gain and an offset a channel, measured where no press reaches."""
+
     @property
     def chosen_prior(self) -> str | None:
         """``--prior``; None is ``INNER``. Raises ``InputError`` for no name of ``STRENGTHS``."""
         return None if check_known("prior", self.prior, (INNER, *STRENGTHS)) == INNER else self.prior
 
     def read(self, data: Path, sensor: str) -> tuple[SensorSpec, RealPresses, Photographs]:
-        """As ``read_data``; doubtful circles are printed."""
-        spec, presses, shots, doubtful = read_data(data, sensor, self.ball_diameter_mm, self.sides, self.split, self.device)
-        for name in doubtful:
-            print(f"the circle of press {name} is doubtful")
+        """As ``read_data``; doubtful circles and presses that are not used are printed."""
+        spec, presses, shots, said = read_data(
+            data, sensor, self.ball_diameter_mm, self.sides, self.split, self.device, border=self.border
+        )
+        for name, what in said.items():
+            print(f"press {name}: {what}")
         return spec, presses, shots
 
 

@@ -32,7 +32,7 @@ class DeviceImages:
             sensor: made with ``observer.make_sensor``; all arrays stay on its device.
 
         Raises:
-            InputError: settings without an implementation on the device: no ``rgb``, a stack, cameras that drift; an optical mode
+            InputError: settings without an implementation on the device: no ``rgb``, a stack, grain, cameras that drift; an optical mode
                 without images on the device.
             BackendError: the renderer or the device does not work here.
         """
@@ -45,6 +45,8 @@ class DeviceImages:
             )
         if settings.stack != 1:
             raise InputError("stack", value=settings.stack, rule="must be 1 on the device, where nothing is kept")
+        if settings.noise:
+            raise InputError("noise", value=True, rule="must be False on the device, where images have no grain")
         if observer.randomization.changes_images:
             raise InputError("randomization", value=observer.randomization, rule="must not change images on the device")
         cut = ImageCut(layout.observed, layout.crop_x, layout.crop_y, layout.downscale)

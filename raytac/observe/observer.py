@@ -118,6 +118,7 @@ class TactileObserver:
             "resolution": self.layout.rendered,
             "num_envs": self.num_envs,
             "seed": self.seed,
+            "noise": settings.noise,
         }
 
     def make_sensor(self, **options: Any) -> TactileSensor:

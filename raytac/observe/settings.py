@@ -72,6 +72,8 @@ class ObservationSettings:
     """As of ``TactileSensor``: a name, or a configuration."""
     markers: str | MarkersConfig = "fots"
     """As of ``TactileSensor``."""
+    noise: bool = False
+    """True adds the camera's own grain to ``rgb``, as of ``TactileSensor``; the rest has none."""
 
     def __post_init__(self) -> None:
         given = check_names("modalities", self.modalities, MODALITIES)
@@ -92,13 +94,14 @@ class ObservationSettings:
             if not isinstance(sides, (tuple, list)) or len(sides) != 4 or not all(is_whole(n) and n >= 0 for n in sides):
                 rule = "must be 'centre', or pixels cut off at left, top, right and bottom, each 0 or more"
                 raise InputError("crop", value=sides, rule=rule)
-        for name in ("difference", "normalise"):
+        for name in ("difference", "normalise", "noise"):
             check_truth(name, getattr(self, name))
         chosen_optics(self.optics)
         markers_config(self.markers)
         check_mapping("scales", self.scales)
-        if self.difference and "rgb" not in self.modalities:
-            raise InputError("difference", value=True, rule="is of images: modalities must have 'rgb'")
+        for name in ("difference", "noise"):
+            if getattr(self, name) and "rgb" not in self.modalities:
+                raise InputError(name, value=True, rule="is of images: modalities must have 'rgb'")
         for name, scale in self.scales.items():
             if name not in SCALES:
                 raise InputError("scales", value=name, rule="must be a modality that has a unit", choices=tuple(SCALES))

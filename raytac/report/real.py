@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from raytac.calibrate.direct_fit import FitSettings
+from raytac.calibrate.drift import settled
 from raytac.calibrate.fit_models import ALONE, MODES, Models, check_fit, fit_models, images_of, mode_times
+from raytac.calibrate.grain import measured_grain
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.presses import RealPresses, Split, by_half, by_press, shallow_to_deep
 from raytac.calibrate.ray_fit import FEWEST
@@ -22,8 +24,9 @@ from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.io.progress import Progress
 from raytac.optics.trace.config import RayTraced
+from raytac.report.real_drift import drift_metrics, drift_rows, grain_metrics, session_lines
 from raytac.report.real_imprints import FITTED, check_imprints, imprint_metrics, imprint_scores, imprint_table
-from raytac.report.real_scores import noise_floor, press_scores, summary
+from raytac.report.real_scores import noise_floor, outliers, press_scores, summary
 from raytac.specs import SensorSpec
 from raytac.specs.press import PADS
 
@@ -43,7 +46,9 @@ class Ablation:
     prior: str | None = None
     """Name of another strength of priors than that of the comparison."""
     settle: bool = True
-    """True averages the image at rest (``Photographs.settled``)."""
+    """True averages the image at rest (``drift.settled``)."""
+    drift: bool = True
+    """Session drift, where the comparison has it."""
     other_shadows: bool = False
     """Cast shadows where the comparison has none, and none where it has."""
 
@@ -72,6 +77,7 @@ ABLATIONS: dict[str, Ablation] = {
     "one_led_a_colour": Ablation(sensor=_one_a_colour),
     "rigid_pad_imprint": Ablation(fixed=("slope",)),
     "one_photograph_at_rest": Ablation(settle=False),
+    "no_session_drift": Ablation(drift=False),
     "untied_leds": Ablation(prior="free"),
 }
 """By the name of their keys in ``metrics.json``."""
@@ -93,6 +99,8 @@ class RealSettings:
     rounds: int = 3
     shadows: bool = False
     """True lets the ray tracer cast shadows on the coat."""
+    drift: bool = True
+    """True takes a gain and an offset a channel of every photograph from its far pixels."""
     imprints: tuple[str, ...] = (FITTED,)
     """Imprints of held-out presses under the ray tracer, of ``real_imprints.IMPRINTS``."""
     level: str = "medium"
@@ -113,7 +121,7 @@ def compare_real(
 ) -> list[Path]:
     """Fit, test and write ``real.md``, ``real.png`` and ``metrics.json`` to ``out``.
 
-    ``shots`` are the fully visible ``presses``.
+    ``shots`` are the ``presses``. Those at the border are fitted with the others, and tested apart: keys ``border.…``.
 
     Raises:
         InputError: a split that leaves too few presses, or a folder that cannot be written.
@@ -121,17 +129,16 @@ def compare_real(
     """
     resolve_device(settings.device)
     began = time.perf_counter() if began is None else began
-    splits: list[tuple[str, Split]] = [("press", split) for split in by_press(len(presses), settings.folds)[: settings.tested]]
-    if settings.regions:
-        splits += [("left_right", by_half(presses)[0]), ("right_left", by_half(presses)[1])]
-        splits += [("shallow_deep", shallow_to_deep(presses))]
+    whole = shots.fully_visible
+    splits = real_splits(presses, whole, settings)
     least = FEWEST if settings.prior is not None else 2 * FEWEST  # a choice halves them again
     for kind, (train, _) in splits:  # now, and not after the fits before it
-        if len(train) < least:
+        count = int(whole[train].sum())
+        if count < least:
             rule = f"are too few to fit the split {kind!r} to: at least {least}"
-            if len(train) >= FEWEST:
+            if count >= FEWEST:
                 rule += f", or {FEWEST} with a named prior"
-            raise InputError("presses", value=len(train), rule=rule)
+            raise InputError("presses", value=count, rule=rule)
     ablations = list(ABLATIONS) if settings.ablations else []
     scores: dict[str, dict[str, list[dict[str, float]]]] = {}
     metrics: dict[str, Metric] = {}
@@ -139,17 +146,25 @@ def compare_real(
     starts: dict[str, list[tuple[float, ...]]] = {}
     imprints: dict[str, list[dict[str, float]]] = {}
     images: dict[int, dict[str, np.ndarray]] = {}
+    bad: dict[str, str] = {}
     with result_folder(out) as folder:  # before the fits, so that a folder that cannot be written is refused at once
         with Progress(total=len(splits) + len(ablations), desc="fits") as bar:
             for number, (kind, (train, test)) in enumerate(splits):
                 models = _fitted(sensor, shots.take(train), settings, bar)
                 priors.setdefault(kind, []).append(models.prior)
                 starts.setdefault(kind, []).append(models.fitted.start_errors)
-                seen, labelled = _tested(models, sensor, shots.take(test))
-                for where, scores_of in (("", seen), ("labelled_", labelled)):
-                    for mode, stack in scores_of.items():
-                        of = scores.setdefault(where + kind, {}).setdefault(mode, [])
-                        of += press_scores(sensor, stack, shots.take(test))
+                bad |= _outliers(models, sensor, shots.take(train), [presses.names[k] for k in train])
+                test, edge = test[whole[test]], test[~whole[test]]
+                for part, prefix in ((test, ""), (edge, "border_")):
+                    if not len(part):
+                        continue
+                    both = _tested(models, sensor, shots.take(part))
+                    for where, scores_of in zip(("", "labelled_"), both, strict=True):
+                        for mode, stack in scores_of.items():
+                            of = scores.setdefault(where + prefix + kind, {}).setdefault(mode, [])
+                            of += press_scores(sensor, stack, shots.take(part))
+                    if part is test:
+                        seen = both[0]
                 if kind == "press":
                     own = {"level": settings.level, "device": settings.device}
                     for key, of in imprint_scores(models, sensor, shots.take(test), settings.imprints, **own).items():
@@ -161,6 +176,7 @@ def compare_real(
                     device = models.modes["raytrace"].device
                 bar.update()
             train, test = splits[0][1]
+            test = test[whole[test]]
             for name in ablations:
                 one = replace(ABLATIONS[name], prior=ABLATIONS[name].prior or priors["press"][0])
                 changed = one.sensor(sensor)
@@ -172,7 +188,7 @@ def compare_real(
             for key, value in summary(scores["press"]["raytrace"][: len(test)]).items():
                 metrics[f"ablation.nothing.{key}"] = value
         for kind, by_mode in scores.items():
-            prefix = "" if kind == "press" else ("labelled." if kind == "labelled_press" else f"{kind}.")
+            prefix = _PREFIXES.get(kind, f"{kind}.")
             for mode, of in by_mode.items():
                 metrics |= {f"{prefix}{mode}.{key}": value for key, value in summary(of).items()}
         metrics |= imprint_metrics(imprints)
@@ -182,13 +198,22 @@ def compare_real(
             for kind, of in starts.items()
             for k, errors in enumerate(of)
         }
-        metrics["noise_floor"] = noise_floor(sensor, shots)
+        metrics["noise_floor"] = noise_floor(sensor, shots.take(whole))
+        steady = settled(sensor, shots.take(whole), drift=settings.drift)
+        level = float(steady.shots.background.mean())
+        metrics |= drift_metrics(steady.drift, steady.background, level)
+        metrics |= grain_metrics(measured_grain(sensor, steady), level)
+        metrics["outliers"] = ", ".join(bad)
+        for name, reason in bad.items():
+            print(f"press {name} is an outlier: {reason}")
         head: dict[str, Metric] = {
             "command": "compare-real",
             "device": device,
             "seed": settings.seed,
             "sensor": sensor.name,
-            "presses": len(shots.presses),
+            "presses": int(whole.sum()),
+            "presses_at_border": int((~whole).sum()),
+            "drift": int(settings.drift),
             "folds": settings.folds,
             "tested_folds": len(priors["press"]),
             "shadows": int(settings.shadows),
@@ -201,10 +226,42 @@ def compare_real(
             **versions(),
         }
         (folder / "real.md").write_text(table_text(metrics, ablations), "utf-8")
+        rows = drift_rows(tuple(presses.names[k] for k in np.flatnonzero(whole)), steady.drift)
+        (folder / "drift.csv").write_text("\n".join(rows) + "\n", "utf-8")
         shown = sorted(images)[len(images) // (2 * SHOWN) :: max(1, len(images) // SHOWN)][:SHOWN]
         draw(shots.presses[shown], [images[k] for k in shown], [shots.circles[k] for k in shown], folder / "real.png")
         write_metrics(folder / "metrics.json", head | metrics | {"wall_s": time.perf_counter() - began})
-    return [out / name for name in ("real.md", "real.png", "metrics.json")]
+    return [out / name for name in ("real.md", "real.png", "drift.csv", "metrics.json")]
+
+
+_PREFIXES = {"press": "", "labelled_press": "labelled.", "border_press": "border.", "labelled_border_press": "labelled.border."}
+"""Beginning of keys in ``metrics.json`` by kind of split; of others it is the kind itself."""
+
+
+def real_splits(presses: RealPresses, whole: np.ndarray, settings: RealSettings) -> list[tuple[str, Split]]:
+    """Splits by name; ``whole`` (N,) marks presses that are fully visible.
+
+    Those and the presses at the border are split apart, so that folds of the former do not depend on the latter. From half to half,
+    and from shallow to deep, presses at the border are only fitted.
+    """
+    inner, edge = np.flatnonzero(whole), np.flatnonzero(~whole)
+    splits: list[tuple[str, Split]] = []
+    for fold, (train, test) in enumerate(by_press(len(inner), settings.folds)[: settings.tested]):
+        held_out = np.arange(len(edge)) % settings.folds == fold
+        own = np.concatenate([inner[train], edge[~held_out]]), np.concatenate([inner[test], edge[held_out]])
+        splits.append(("press", own))
+    if settings.regions:
+        visible = presses.take(inner)
+        middle, relative = presses.resolution[0] / 2, presses.circles[:, 2] / presses.ball_radius
+        is_left = presses.circles[edge, 0] < middle
+        deepest = shallow_to_deep(visible)
+        for kind, (train, test), also in (
+            ("left_right", by_half(visible)[0], is_left),
+            ("right_left", by_half(visible)[1], ~is_left),
+            ("shallow_deep", deepest, relative[edge] <= relative[inner[deepest[0]]].max()),
+        ):
+            splits.append((kind, (np.concatenate([inner[train], edge[also]]), inner[test])))
+    return splits
 
 
 def _fitted(
@@ -226,6 +283,7 @@ def _fitted(
         starts=settings.starts,
         rounds=settings.rounds,
         settle=one.settle,
+        drift=settings.drift and one.drift,
         prior=settings.prior if one.prior is None else one.prior,
         tracing=RayTraced(shadows=settings.shadows != one.other_shadows, bounce=one.bounce),
         tick=lambda stage, cost: bar.set_postfix_str(f"{stage}, cost {cost:.4g}"),
@@ -233,20 +291,32 @@ def _fitted(
 
 
 def _tested(models: Models, sensor: SensorSpec, shots: Photographs) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Images of every mode and of the background at refined circles and at labelled ones."""
-    refined, slopes = models.circles(shots), models.fitted.state.slopes
+    """Images of every mode and of the background at refined circles and at labelled ones.
+
+    Modes' images have the session drift of their photographs; the background is the one photograph at rest.
+    """
+    refined, slopes, drift = models.circles(shots), models.fitted.state.slopes, models.drift(shots)
     nothing = np.broadcast_to(shots.background, shots.presses.shape)
     scores = []
     for circles in (refined, shots.circles):
-        own = {name: images_of(mode, sensor, shots, circles, slopes) for name, mode in models.modes.items()}
+        own = {name: drift.applied(images_of(mode, sensor, shots, circles, slopes)) for name, mode in models.modes.items()}
         scores.append(own | {"background": nothing})
     return scores[0], scores[1]
 
 
+def _outliers(models: Models, sensor: SensorSpec, shots: Photographs, names: Sequence[str]) -> dict[str, str]:
+    """Fitted presses that disagree with the others, and why, by the fitted ray tracer."""
+    state, drift = models.fitted.state, models.settled.drift
+    images = drift.applied(images_of(models.modes["raytrace"], sensor, shots, state.circles, state.slopes))
+    errors = np.array([score["contact_mae"] for score in press_scores(sensor, images, shots)])
+    return outliers(names, errors, state.circles, shots)
+
+
 def check_folds(presses: RealPresses, folds: int) -> None:
-    """Raises ``InputError`` for folds that leave too few presses to fit to."""
-    if len(presses) - -(-len(presses) // max(folds, 1)) < FEWEST:
-        raise InputError("presses", value=len(presses), rule=f"are too few for {folds} folds: {FEWEST} must be left to fit to")
+    """Raises ``InputError`` for folds that leave too few fully visible presses to fit to."""
+    count = int(presses.fully_visible.sum())
+    if count - -(-count // max(folds, 1)) < FEWEST:
+        raise InputError("presses", value=count, rule=f"are too few for {folds} folds: {FEWEST} must be left to fit to")
 
 
 _ROWS = (
@@ -288,6 +358,12 @@ def table_text(metrics: Mapping[str, Metric], ablations: Sequence[str]) -> str:
             cells = [f"{cell(f'{prefix}{key}.contact_mae')} ({cell(f'{prefix}{key}.ring_mae')})" for prefix, _ in shown]
             lines.append(f"| {name} | {' | '.join(cells)} |")
         lines.append("")
+    if "border.raytrace.contact_mae" in metrics:
+        lines += ["| held-out presses at the border | contact MAE | ring MAE |", "|---|---|---|"]
+        for key, name in _ROWS:
+            lines.append(f"| {name} | {cell(f'border.{key}.contact_mae')} | {cell(f'border.{key}.ring_mae')} |")
+        lines.append("")
+    lines += session_lines(metrics)
     lines += imprint_table(metrics)
     if ablations:
         lines += ["| ray tracer, first fold | contact MAE | ring MAE |", "|---|---|---|"]

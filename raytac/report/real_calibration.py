@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from raytac.calibrate.direct_fit import FitSettings
+from raytac.calibrate.drift import no_drift
 from raytac.calibrate.fit_models import ALONE, SHADOW_TABLES, check_fit, fit_models, images_of
+from raytac.calibrate.grain import measured_grain
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.prior_choice import INNER
 from raytac.device import resolve_device
@@ -24,16 +26,24 @@ from raytac.optics.taxim.folder import CALIBRATION_FILES, save_calibration
 from raytac.optics.taxim.mode import TaximMode
 from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.tracer import Tracer
-from raytac.report.real_scores import press_scores, summary
+from raytac.report.real_drift import drift_metrics, drift_rows, grain_metrics
+from raytac.report.real_scores import outliers, press_scores, summary
 from raytac.specs import SensorSpec
-from raytac.specs.sensor import OpticsSpec
+from raytac.specs.sensor import NoiseSpec, OpticsSpec
 from raytac.specs.sensor_file import lights_text, sensor_files
 
 FITTED = ("raytrace", "taxim", "mlp")
 """Models that photographs are fitted by; Phong's has nothing to fit."""
-OUTLIER = 2.0
-"""A press whose contact error is so many times the median is reported as an outlier."""
-FILES = (*CALIBRATION_FILES, "mlp.npz", "lights.toml", "sensor.toml", "marker_motion.toml", "circles.csv", "metrics.json")
+FILES = (
+    *CALIBRATION_FILES,
+    "mlp.npz",
+    "lights.toml",
+    "sensor.toml",
+    "marker_motion.toml",
+    "circles.csv",
+    "drift.csv",
+    "metrics.json",
+)
 
 
 def run_calibrate_optics(
@@ -53,10 +63,12 @@ def run_calibrate_optics(
     seed: int,
     start: float,
     shadow_table: str = SHADOW_TABLES[0],
+    drift: bool = True,
 ) -> list[Path]:
     """Fit ``model`` to all but every ``holdout``-th of ``shots`` and write it to ``out``.
 
-    An error leaves nothing there.
+    Of fully visible presses and of those at the border every ``holdout``-th is held out; the latter have scores of their own. ``drift``:
+    session drift is part of the model. An error leaves nothing there.
 
     Raises:
         InputError: an unknown model, device or strength of priors, ``holdout`` of 1 or less than 0, too few presses, fewer than
@@ -71,11 +83,13 @@ def run_calibrate_optics(
     resolve_device(device)
     if int(holdout) != holdout or holdout < 0 or holdout == 1:
         raise InputError("holdout", value=holdout, rule="must be 0 or a whole number >= 2")
-    if holdout > len(shots.presses):
+    whole = shots.fully_visible
+    if holdout > whole.sum():
         rule = f"are too few to hold out every {holdout}th: name a smaller holdout, or 0 for none"
-        raise InputError("presses", value=len(shots.presses), rule=rule)
-    index = np.arange(len(shots.presses))
-    is_test = index % holdout == holdout - 1 if holdout else np.zeros(len(index), bool)
+        raise InputError("presses", value=int(whole.sum()), rule=rule)
+    index = np.arange(len(whole))
+    rank = np.where(whole, np.cumsum(whole), np.cumsum(~whole)) - 1
+    is_test = rank % holdout == holdout - 1 if holdout else np.zeros(len(index), bool)
     train, test = shots.take(index[~is_test]), shots.take(index[is_test])
     with result_folder(out, FILES) as folder:  # before the fit, so that a folder that cannot be written is refused at once
         with Progress(desc=f"calibrate {model}", unit="step") as bar:
@@ -95,6 +109,7 @@ def run_calibrate_optics(
                 rounds=rounds,
                 prior=prior,
                 shadow_table=shadow_table,
+                drift=drift,
                 tracing=RayTraced(shadows=shadows),
                 tick=tick,
             )
@@ -118,25 +133,39 @@ def run_calibrate_optics(
             "start_lights": "at walls" if sensor.lights.source is None else sensor.lights.source.stem,
             "presses.fitted": int((~is_test).sum()),
             "presses.held_out": int(is_test.sum()),
+            "presses.at_border": int((~whole).sum()),
+            "drift": int(drift),
             **versions(),
         }
         circles = shots.circles.copy()
         circles[~is_test] = fitted.state.circles
         if is_test.any():
             circles[is_test] = models.circles(test)
-        scores: dict[str, list[dict[str, float]]] = {}
+        drifts = no_drift(len(index))
+        for chosen, own in ((~is_test, models.settled.drift), (is_test, models.drift(test))):
+            drifts.gain[chosen], drifts.offset[chosen] = own.gain, own.offset
+        fitted_errors = np.empty(0)
         for name, one in models.modes.items():
             for part, chosen, some in (("fitted", ~is_test, train), ("held_out", is_test, test)):
-                if chosen.any():
-                    key = part if name == model else f"{part}.alone"
-                    scores[key] = press_scores(sensor, images_of(one, sensor, some, circles[chosen], fitted.state.slopes), some)
-                    metrics |= {f"{key}.{measure}": value for measure, value in summary(scores[key]).items()}
+                if not chosen.any():
+                    continue
+                images = drifts.take(chosen).applied(images_of(one, sensor, some, circles[chosen], fitted.state.slopes))
+                scores = press_scores(sensor, images, some)
+                key = part if name == model else f"{part}.alone"
+                for prefix, of in ((key, whole[chosen]), (f"border.{key}", ~whole[chosen])):
+                    if of.any():
+                        mean = summary([score for score, is_of in zip(scores, of, strict=True) if is_of])
+                        metrics |= {f"{prefix}.{measure}": value for measure, value in mean.items()}
+                if key == "fitted":
+                    fitted_errors = np.array([score["contact_mae"] for score in scores])
         metrics |= {f"cost.round_{k}": cost for k, cost in enumerate(fitted.costs)}
-        errors = np.array([score["contact_mae"] for score in scores["fitted"]])
-        bad = [names[k] for k, error in zip(index[~is_test], errors, strict=True) if error > OUTLIER * np.median(errors)]
+        bad = outliers([names[k] for k in index[~is_test]], fitted_errors, fitted.state.circles, train)
         metrics["outliers"] = ", ".join(bad)
-        for name in bad:
-            print(f"press {name} is an outlier: its error in the contact is more than {OUTLIER:g} times the median")
+        for name, reason in bad.items():
+            print(f"press {name} is an outlier: {reason}")
+        metrics |= drift_metrics(drifts, models.settled.background, float(models.rest.mean()))
+        grain = measured_grain(sensor, models.settled)
+        metrics |= grain_metrics(grain, float(models.rest.mean()))
         if model == "raytrace":
             error = f"{metrics.get('held_out.contact_mae', metrics['fitted.contact_mae']):.2f}"
             what = "on held-out presses" if is_test.any() else "on the fitted presses"
@@ -144,7 +173,7 @@ def run_calibrate_optics(
             (folder / "lights.toml").write_text(lights_text(fitted.sensor.lights, comment), "utf-8")
             alone = models.modes[ALONE]
             assert isinstance(alone, Tracer)
-            written = dataclasses.replace(alone.sensor, optics=OpticsSpec(shadows=shadows))
+            written = dataclasses.replace(alone.sensor, optics=OpticsSpec(shadows=shadows), noise=grain or NoiseSpec())
             for name, text in sensor_files(written).items():
                 (folder / name).write_text(text, "utf-8")
         elif isinstance(mode, TaximMode):
@@ -154,6 +183,7 @@ def run_calibrate_optics(
         rows = ["press,held_out,cx_px,cy_px,r_px"]
         rows += [f"{name},{int(h)},{x:.3f},{y:.3f},{r:.3f}" for name, h, (x, y, r) in zip(names, is_test, circles, strict=True)]
         (folder / "circles.csv").write_text("\n".join(rows) + "\n", "utf-8")
+        (folder / "drift.csv").write_text("\n".join(drift_rows(names, drifts)) + "\n", "utf-8")
         write_metrics(folder / "metrics.json", metrics | {"wall_s": time.perf_counter() - start})
         written = sorted(path.name for path in folder.iterdir())
     return [out / name for name in written]

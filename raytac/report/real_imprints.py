@@ -43,7 +43,8 @@ def imprint_scores(
     circles = np.column_stack([refined[:, :2], shots.circles[:, 2]])
     for name in names:
         if name == FITTED:
-            images = images_of(models.modes[_MODE], sensor, shots, circles, models.fitted.state.slopes)
+            drift = models.drift(shots)
+            images = drift.applied(images_of(models.modes[_MODE], sensor, shots, circles, models.fitted.state.slopes))
             out[f"{name}.{_MODE}"] = press_scores(sensor, images, shots)
         else:
             physics: PhysicsConfig = Rigid() if name == "rigid" else Ipc(level=level)
@@ -61,6 +62,7 @@ def _press(
     physics: PhysicsConfig,
     device: str,
 ) -> None:
+    drift = models.drift(shots)
     keys = name, f"{name}.{_MODE}", f"{name}.{AT_OVERLAP}.{_MODE}"
     own, at_depth, at_overlap = (out.setdefault(key, []) for key in keys)
     balls = pressed_balls(sensor, circles, shots.radius, physics, pitch=GRID_PITCH, device=device)
@@ -70,7 +72,7 @@ def _press(
             if surface is not None:
                 rgb = models.modes[_MODE].render(surface).rgb
                 assert rgb is not None
-                scores += press_scores(sensor, rgb, one)
+                scores += press_scores(sensor, drift.take([k]).applied(rgb), one)
         reached = (
             {} if ball.surface is None else {"depth_over_overlap": ball.depth / ball.overlap_depth, "depth_mm": 1e3 * ball.depth}
         )

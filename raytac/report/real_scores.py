@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from raytac.calibrate.photographs import FAR, Photographs
@@ -9,6 +11,10 @@ from raytac.errors import BackendError
 from raytac.report.image_error import psnr, rmse, ssim_map
 from raytac.specs import SensorSpec
 
+OUTLIER = 2.0
+"""A press whose contact error is so many times the median is an outlier."""
+MOVED = 4.0 / 320
+"""A press whose label is so far from the fitted circle, over the image's width, is one too."""
 BOX_MARGIN = 15
 """Pixels that the box reaches beyond the labelled circle."""
 
@@ -36,7 +42,7 @@ def press_scores(sensor: SensorSpec, images: np.ndarray, shots: Photographs) -> 
             "frame_mae": float(off.mean()),
         }
         try:
-            ssim = ssim_map(np.clip(image, 0, 255).astype(np.uint8), real.astype(np.uint8))
+            ssim = ssim_map(np.clip(np.rint(image), 0, 255).astype(np.uint8), real.astype(np.uint8))
             score["box_ssim"] = float(np.nanmean(ssim[box]))
         except BackendError:
             pass
@@ -47,6 +53,24 @@ def press_scores(sensor: SensorSpec, images: np.ndarray, shots: Photographs) -> 
 def summary(scores: list[dict[str, float]]) -> dict[str, float]:
     """Means over presses."""
     return {key: float(np.mean([score[key] for score in scores])) for key in scores[0]}
+
+
+def outliers(names: Sequence[str], errors: np.ndarray, circles: np.ndarray, shots: Photographs) -> dict[str, str]:
+    """Presses that do not agree with the others, by name, and why.
+
+    ``errors`` (N,): contact errors of fitted presses; ``circles`` (N, 3) [px]: as fitted, against the labels of ``shots``.
+    """
+    reasons: dict[str, str] = {}
+    limit = MOVED * shots.background.shape[1]
+    for name, error, moved in zip(names, errors, np.abs(circles - shots.circles).max(1), strict=True):
+        why = []
+        if error > OUTLIER * np.median(errors):
+            why.append(f"its error in the contact is more than {OUTLIER:g} times the median")
+        if moved > limit:
+            why.append(f"its label is {moved:.1f} px from the fitted circle, more than {limit:g}")
+        if why:
+            reasons[name] = " and ".join(why)
+    return reasons
 
 
 def noise_floor(sensor: SensorSpec, shots: Photographs) -> float:

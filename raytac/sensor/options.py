@@ -43,6 +43,7 @@ class SensorSettings(TypedDict, total=False):
     resolution: tuple[int, int] | str | None
     device: str
     pitch: float | None
+    noise: bool
 
 
 def sensor_outputs(optics: str | OpticsConfig[OpticalMode] | type[OpticsConfig[OpticalMode]]) -> tuple[str, ...]:

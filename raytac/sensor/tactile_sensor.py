@@ -11,7 +11,7 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from raytac.checks import MOST_ENVIRONMENTS, check_seed, check_seeds, check_whole
+from raytac.checks import MOST_ENVIRONMENTS, check_seed, check_seeds, check_truth, check_whole
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.frame import IMAGES, TactileFrame
@@ -22,6 +22,7 @@ from raytac.markers.pattern import MarkerPattern, dot_ink
 from raytac.markers.registry import MARKERS
 from raytac.markers.tracker import MarkerFrame, MarkerTracker
 from raytac.optics.base import OPTICAL_OUTPUTS, BuiltOptics, OpticalMode, OpticsConfig, OpticsImages, start
+from raytac.optics.grain import Grain
 from raytac.optics.registry import chosen_optics
 from raytac.physics.base import Pad, PadReading, PhysicsConfig, TargetArrays
 from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
@@ -79,6 +80,7 @@ class TactileSensor:
         num_envs: int = 1,
         pitch: float | None = None,
         markers: str | MarkersConfig | None = None,
+        noise: bool = False,
     ) -> None:
         """Check everything and compute nothing yet.
 
@@ -97,6 +99,7 @@ class TactileSensor:
             pitch: spacing of the pad's grid [m]; None is that of a pixel on the pad, at most 0.1 mm.
             markers: marker model, a name of ``raytac.markers.MARKERS`` or a configuration such as ``Fots(perturbation=…)``; frames then
                 hold markers, and images show the dots. None leaves them out, and images show a plain coat.
+            noise: True adds the camera's grain to ``rgb``, as the sensor file's ``[noise]`` says; ``rest`` and ``layers`` have none.
 
         Raises:
             InputError: an unknown name or a value out of range; the message lists the choices.
@@ -127,6 +130,8 @@ class TactileSensor:
         if self.markers is not None:
             MarkerPattern.of(self.spec, self.resolution)  # refuse a pattern outside the view now
         self._tracker: MarkerTracker | None = None
+        wanted = check_truth("noise", noise)
+        self._grain = Grain(self.spec, self.resolution, seed=self.seed, batch=self.num_envs) if wanted else None
         self.optics.check(self.spec)
         self._mode: OpticalMode | None = None
         self._pad: Pad | None = None
@@ -237,6 +242,9 @@ class TactileSensor:
         self._is_narrow = False
         if own_seeds is not None and self.markers is not None:
             self.marker_tracker.reseed(range(self.num_envs), own_seeds)
+        if own_seeds is not None and self._grain is not None:
+            for env, own_seed in enumerate(own_seeds):
+                self._grain.reseed(env, own_seed)
         if self._tracker is not None:
             self._tracker.reset()
         return self._pad
@@ -274,7 +282,12 @@ class TactileSensor:
             markers = self.marker_tracker.update(surface, envs, shear=reading.shear)
             surface, done = self._dotted(surface, markers), time.perf_counter()
             time_ms["markers"] = 1e3 * (done - began) - time_ms["surface"]
-        return self._frame(surface, markers, done, time_ms, **forces)
+        seeds = None if self._grain is None else self._grain.seeds(envs if envs is not None else self._rows(surface))
+        return self._frame(surface, markers, done, time_ms, grain=seeds, **forces)
+
+    def _rows(self, surface: GelSurface) -> list[int]:
+        """Environments of the rows of a surface, which may have fewer or more of them."""
+        return [row % self.num_envs for row in range(surface.batch)]
 
     def _forces(self, reading: PadReading) -> dict[str, Any]:
         """Fields of a frame about forces, as far as they are asked for; none of a bare surface."""
@@ -308,12 +321,23 @@ class TactileSensor:
             self._is_narrow = warn_if_narrow(cells, getattr(self._used, "level", None), stacklevel=4)
 
     def _frame(
-        self, surface: GelSurface, markers: MarkerFrame | None, done: float, time_ms: dict[str, float], **fields: Any
+        self,
+        surface: GelSurface,
+        markers: MarkerFrame | None,
+        done: float,
+        time_ms: dict[str, float],
+        *,
+        grain: list[int] | None = None,
+        **fields: Any,
     ) -> TactileFrame:
-        """The frame with the images that are asked for; ``done``: when the surface was there."""
+        """The frame with the images that are asked for.
+
+        ``done``: when the surface was there; ``grain``: seeds of the images' noise, None for none.
+        """
         fields |= {"height": surface.height if "height" in self.outputs else None, "markers": markers}
         if self._optical_outputs:
-            fields["images"] = partial(_by_name, start(self.optical_mode, surface))
+            images = start(self.optical_mode, surface)
+            fields["images"] = partial(_by_name, images, None if grain is None else partial(self._with_grain, seeds=grain))
             time_ms["optics"] = 1e3 * (time.perf_counter() - done)
         return TactileFrame(surface, time_ms=time_ms, label=self.label, **fields)  # a mode is named once it is built
 
@@ -379,6 +403,10 @@ class TactileSensor:
         """Underside of the loaded object [m], (B, Ny, Nx), inf beside it; None without an object."""
         return None if self._pad is None else self._pad.object_height(surface)
 
+    def _with_grain(self, rgb: np.ndarray, seeds: list[int]) -> np.ndarray:
+        assert self._grain is not None
+        return self._grain.added(rgb, seeds)
+
     @property
     def optical_mode(self) -> OpticalMode:
         """The renderer, built on first use. Raises as ``OpticsConfig.build``."""
@@ -390,7 +418,10 @@ class TactileSensor:
         return mode
 
 
-def _by_name(images: Callable[[], OpticsImages]) -> dict[str, Any]:
-    """Fields of a frame from images that are waited for."""
+def _by_name(images: Callable[[], OpticsImages], seen: Callable[[np.ndarray], np.ndarray] | None = None) -> dict[str, Any]:
+    """Fields of a frame from images that are waited for; ``seen`` makes ``rgb`` the camera's."""
     known = images()
-    return {name: getattr(known, name, None) for name in IMAGES}
+    fields = {name: getattr(known, name, None) for name in IMAGES}
+    if seen is not None and fields["rgb"] is not None:
+        fields["rgb"] = seen(fields["rgb"])
+    return fields

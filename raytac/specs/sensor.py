@@ -82,6 +82,10 @@ SENSOR_SCHEMA: Final[dict[str, Schema]] = {
         "plate_thickness_mm": Number("[0, 50]"),
     },
     "optics": {"shadows": Flag(default=True)},
+    "noise": {
+        "dark_variance": Number("[0, 10000]", length=3, default=(0.0, 0.0, 0.0)),
+        "bright_variance": Number("[0, 10000]", length=3, default=(0.0, 0.0, 0.0)),
+    },
 }
 """Table (``""``: the top of the file) to its keys."""
 
@@ -295,6 +299,27 @@ class OpticsSpec:
 
 
 @dataclass(frozen=True)
+class NoiseSpec:
+    """Grain of the camera: white noise of 8-bit values, whose variance is linear in the level.
+
+    σ²(u) = dark + (bright − dark) u / 255 for a pixel of the camera's own resolution at level u. Images have it on request alone.
+    """
+
+    dark_variance: Vec3 = (0.0, 0.0, 0.0)
+    """σ² by channel at level 0 [levels²]."""
+    bright_variance: Vec3 = (0.0, 0.0, 0.0)
+    """σ² by channel at level 255 [levels²]."""
+
+    def __post_init__(self) -> None:
+        check_fields(vars(self), SENSOR_SCHEMA["noise"], "noise")
+
+    @property
+    def is_none(self) -> bool:
+        """True if no pixel has noise."""
+        return not any((*self.dark_variance, *self.bright_variance))
+
+
+@dataclass(frozen=True)
 class LedSpec:
     """One LED: a rectangle that emits from its front side with radiance ∝ cos^(n−1) θ."""
 
@@ -354,6 +379,7 @@ SENSOR_PARTS: Final = {
     "markers": MarkerSpec,
     "refraction": RefractionSpec,
     "optics": OpticsSpec,
+    "noise": NoiseSpec,
 }
 """Table of a sensor file to the dataclass that holds it."""
 
@@ -375,6 +401,7 @@ class SensorSpec:
     refraction: RefractionSpec
     lights: LightsSpec
     optics: OpticsSpec = OpticsSpec()
+    noise: NoiseSpec = NoiseSpec()
     marker_motion: MarkerMotionSpec | None = None
     """Motion of the pad's markers under a load, for fitted models; None if not fitted."""
     source: Path | None = None

@@ -26,7 +26,7 @@ from raytac.specs.toml import Table, Text, read_toml, split_unit
 
 _LONGEST_CHAIN = 32
 """Files that a sensor can be built on, one after the other."""
-_MAY_LACK = ("optics",)
+_MAY_LACK = ("optics", "noise")
 """Tables that a file without a base need not give."""
 
 
@@ -177,14 +177,16 @@ _MOTION = "marker_motion.toml"
 def sensor_files(sensor: SensorSpec) -> dict[str, str]:
     """Texts by name of file: ``sensor.toml``, and further files that it needs.
 
-    Its lights are in a ``lights.toml`` beside it, which is not among them. A sensor whose lights, response and optics are all that it
-    does not have from a shipped one names that as its base; any other holds every table itself. Markers' motion is a shipped name or a
+    Its lights are in a ``lights.toml`` beside it, which is not among them. A sensor whose lights, response, optics and noise are all that
+    it does not have from a shipped one names that as its base; any other holds every table itself. Markers' motion is a shipped name or a
     file beside it. No path of this machine is in it.
     """
     files: dict[str, str] = {}
     base = _shipped_base(sensor)
     head = ['lights = "lights.toml"'] if base is None else [f'base = "{base}"', 'lights = "lights.toml"']
-    tables = ["response", "optics"] if base is not None else [name for name in SENSOR_SCHEMA if name]
+    tables = ["response", "optics", "noise"] if base is not None else [name for name in SENSOR_SCHEMA if name]
+    if sensor.noise.is_none and (base is None or load_sensor(base).noise.is_none):
+        tables.remove("noise")
     if base is None and sensor.marker_motion is not None:
         shipped = _shipped_motion(sensor.marker_motion)
         head.append(f'marker_motion = "{shipped or _MOTION}"')
@@ -195,12 +197,12 @@ def sensor_files(sensor: SensorSpec) -> dict[str, str]:
 
 
 def _shipped_base(sensor: SensorSpec) -> str | None:
-    """Name of the shipped sensor that ``sensor`` is but for lights, response, optics; or None."""
+    """Name of the shipped sensor that this is but for lights, response, optics, noise; or None."""
     source = sensor.source
     if source is None or source.stem not in available("sensor") or source.resolve() != find_file("sensor", source.stem).resolve():
         return None
     shipped = load_sensor(source.stem)
-    own = replace(sensor, lights=shipped.lights, response=shipped.response, optics=shipped.optics)
+    own = replace(sensor, lights=shipped.lights, response=shipped.response, optics=shipped.optics, noise=shipped.noise)
     return source.stem if own == shipped else None
 
 

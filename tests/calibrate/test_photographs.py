@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from raytac.calibrate.photographs import Photographs, read_photographs
+from raytac.calibrate.photographs import read_photographs
 from raytac.errors import InputError
 from raytac.io.images import write_png
 from raytac.specs import SensorSpec, load_sensor
@@ -21,20 +21,6 @@ def sensor() -> SensorSpec:
     return load_sensor("gelsight_mini")
 
 
-def test_the_settled_image_at_rest_is_the_mean_of_what_no_press_reaches(sensor: SensorSpec) -> None:
-    """Two presses of noise about 90 and a photograph of 84: means of three values far from both, of two or one where contacts are."""
-    rng = np.random.default_rng(0)
-    circles = np.array([[80.0, 60.0, 20.0], [240.0, 180.0, 20.0]])
-    presses = 90 + rng.integers(-5, 6, (2, 240, 320, 3)).astype(float)
-    presses[0, 60, 80], presses[1, 180, 240] = 250.0, 250.0
-    shots = Photographs(np.full((240, 320, 3), 84.0), presses, circles, np.full(2, RADIUS))
-    found = shots.settled(sensor)
-    np.testing.assert_array_equal(found.background[120, 160], np.rint((84 + presses[:, 120, 160].sum(0)) / 3))
-    np.testing.assert_array_equal(found.background[60, 80], np.rint((84 + presses[1, 60, 80]) / 2))
-    np.testing.assert_array_equal(found.background[180, 240], np.rint((84 + presses[0, 180, 240]) / 2))
-    np.testing.assert_array_equal(found.presses, presses)
-
-
 def test_photographs_are_read_or_refused(sensor: SensorSpec, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="tell a layout"):
         read_photographs(tmp_path, sensor)
@@ -44,7 +30,8 @@ def test_photographs_are_read_or_refused(sensor: SensorSpec, tmp_path: Path) -> 
     head, row = "diameter,index,cx_px,cy_px,r_px,fully_visible\n", "6.310mm,4,100.5,80,30,1\n"
     (tmp_path / "labels.csv").write_text(head + row + "6.310mm,5,1,1,30,0\n", "utf-8")
     found = read_photographs(tmp_path, sensor)
-    assert found.radius == pytest.approx([RADIUS]) and found.presses.shape == (1, 240, 320, 3)
+    assert found.radius == pytest.approx([RADIUS, RADIUS]) and found.presses.shape == (2, 240, 320, 3)
+    assert found.fully_visible.tolist() == [True, False], "presses at the border are read, and marked"
     assert np.all(found.presses == 128) and np.all(found.background == 128)
     assert found.shrunk(8).background.shape == (30, 40, 3)
     assert found.distance(sensor)[0, 79, 100] == pytest.approx(math.hypot(0, 0.5) / 30)
