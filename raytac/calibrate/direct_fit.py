@@ -10,6 +10,7 @@ of LEDs) can be given as ``extra`` light of every LED, with its slopes by the LE
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,12 +25,14 @@ from raytac.calibrate.light_parameters import (
     HEIGHT,
     HEIGHTS,
     REFERENCE_DISTANCE,
+    VIRTUAL_CEILING,
     LightParameters,
     darkest,
     side_ties,
 )
 from raytac.calibrate.photographs import Photographs, decode, encode
 from raytac.specs import LightsSpec, SensorSpec
+from raytac.specs.sensor_check import view_edges
 
 SIGMA = {
     "place": 4.0,
@@ -52,6 +55,8 @@ ACTIVE = 6
 """Most times that a step is solved for with more parameters at their bounds."""
 STEP = 1e-5
 """Step of the derivatives by response and imprint."""
+_WIDEST_PART = 2e-3
+"""Distance [m] from an LED's centre to a corner that the coat's sag is taken at."""
 REST_FACTOR = 8
 """The image at rest is fitted as means of so many pixels squared."""
 
@@ -131,6 +136,22 @@ class DirectFit:
         self._sees_heights = extra is not None and HEIGHT in extra.by_led
         self.circle_sigma = CIRCLE_SIGMA * native[0]
         self.ties = side_ties(start.p, len(self.flat(start)))
+        self.anchor, self.hold = self.flat(start), 0.0
+
+    def near(self, state: FitState, hold: float) -> DirectFit:
+        """The same problem with LEDs held near those of ``state``.
+
+        A deviation of one sigma there costs ``hold`` [levels²]: extra light is known to first order about that state alone.
+        """
+        other = copy.copy(self)
+        other.anchor, other.hold = self.flat(state), hold
+        return other
+
+    def _held(self, state: FitState) -> np.ndarray:
+        """Stiffness of every parameter to the anchor, (n,): that of LEDs' rows."""
+        stiff = np.zeros(len(self.anchor))
+        stiff[: state.p.leds.size] = self.hold
+        return stiff / self.sigma(state.p) ** 2
 
     def _geometry(self, state: FitState, u: np.ndarray, v: np.ndarray, press: np.ndarray) -> PixelGeometry:
         return pixel_geometry(self.sensor, u, v, press, state.circles, self.shots.radius, state.slopes)
@@ -192,14 +213,14 @@ class DirectFit:
 
     def inside_bounds(self, state: FitState) -> FitState:
         """Every parameter moved to what a sensor accepts: LEDs in the case, heights in ``HEIGHTS``."""
-        p, half = state.p, 5e2 * np.array(self.sensor.case.size)
+        p = state.p
         leds, response = p.leds.copy(), p.response.copy()
         leds[:, 4], leds[:, 5] = np.clip(leds[:, 4], -1.4, 1.4), np.clip(leds[:, 5], 1.0, 15.0)
         if self._sees_heights:
             leds[:, HEIGHT] = np.clip(leds[:, HEIGHT], *HEIGHTS)
         reach = 0.02 + _reach(p.template, leds)
-        floor = 1e3 * self.sensor.case.floor_z
-        leds[:, :3] = np.clip(leds[:, :3], reach + np.array([-half[0], -half[1], floor]), np.array([*half, CEILING]) - reach)
+        low, high = self._space(p, leds)
+        leds[:, :3] = np.clip(leds[:, :3], reach + low, np.maximum(high - reach, reach + low))
         response[0], response[1:4] = np.clip(response[0], 1.0, 2.4), np.clip(response[1:4], 0, DARKEST)
         a1 = np.clip(response[4], -2.0, 0.5)
         response[4], response[5] = a1, np.clip(response[5], max(-0.3, -0.75 - a1), 1.5)
@@ -207,6 +228,26 @@ class DirectFit:
         circles = state.circles.copy()
         circles[:, 2] = np.clip(circles[:, 2], 3, None)
         return FitState(changed, state.slopes, circles)
+
+    def _space(self, p: LightParameters, leds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Least and largest x, y and z [mm] of LEDs, (L, 3) each, before what they reach.
+
+        LEDs lie in the case and below gel and plate; virtual sources up to the coat, on that side of the view where they begin.
+        """
+        half, pad = 5e2 * np.array(self.sensor.case.size), self.sensor.gelpad
+        high = np.tile([*half, CEILING], (len(leds), 1))
+        low = np.tile([*-half, 1e3 * self.sensor.case.floor_z], (len(leds), 1))
+        places = np.array([led.position for led in p.template.leds])
+        x_edges, y_edges = view_edges(self.sensor)
+        for k in np.flatnonzero(p.virtual):
+            x, y = places[k, :2]
+            beyond = [(x_edges[0] - x, 0, high, x_edges[0]), (x - x_edges[1], 0, low, x_edges[1])]
+            beyond += [(y_edges[0] - y, 1, high, y_edges[0]), (y - y_edges[1], 1, low, y_edges[1])]
+            _, axis, bound, edge = max(beyond, key=lambda side: side[0])
+            bound[k, axis] = 1e3 * edge
+            inside = [min(abs(c) + _WIDEST_PART, size / 2) for c, size in zip(1e-3 * leds[k, :2], pad.size, strict=True)]
+            high[k, 2] = VIRTUAL_CEILING - 1e3 * pad.sag(*inside)
+        return low, high
 
     def residuals(self, state: FitState) -> tuple[np.ndarray, np.ndarray]:
         """Residuals [levels] of pressed pixels (M, 3) and the image at rest (K, 3), not weighted."""
@@ -223,7 +264,13 @@ class DirectFit:
         x = (self.flat(state) - self.flat(self.start)) / self.sigma(state.p)
         c, tied = (state.circles - self.shots.circles) / self.circle_sigma, self.ties.off(self.flat(state))
         images = (robust[0] * self.share**2).sum() + (robust[1] * self.rest_share**2).sum()
-        priors = self.settings.prior * (x @ x) + self.settings.ties * (tied @ tied) + CIRCLE_PRIOR * (c * c).sum()
+        away = self.flat(state) - self.anchor
+        priors = (
+            self.settings.prior * (x @ x)
+            + self._held(state) @ away**2
+            + self.settings.ties * (tied @ tied)
+            + CIRCLE_PRIOR * (c * c).sum()
+        )
         return float(images + priors)
 
     def jacobian(self, state: FitState) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
@@ -314,9 +361,14 @@ class DirectFit:
         n = size + 3 * count
         normal, slope = np.zeros((n, n)), np.zeros(n)
         normal[:size, :size] = (jac.T * w) @ jac + (rest_jac.T * rest_w) @ rest_jac
-        normal[:size, :size] += np.diag(settings.prior / sigma**2) + settings.ties * self.ties.matrix.T @ self.ties.matrix
+        held = self._held(state)
+        normal[:size, :size] += np.diag(settings.prior / sigma**2 + held) + settings.ties * self.ties.matrix.T @ self.ties.matrix
         slope[:size] = (jac.T * w) @ off.ravel() + (rest_jac.T * rest_w) @ rest_off.ravel()
-        slope[:size] += settings.prior * (x - x0) / sigma**2 + settings.ties * self.ties.matrix.T @ self.ties.off(x)
+        slope[:size] += (
+            settings.prior * (x - x0) / sigma**2
+            + held * (x - self.anchor)
+            + settings.ties * self.ties.matrix.T @ self.ties.off(x)
+        )
         own = np.repeat(self.press, 3)
         first = np.searchsorted(own, np.arange(count + 1))
         for k in range(count):

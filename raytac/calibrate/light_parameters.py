@@ -26,10 +26,14 @@ DARKEST = 0.85
 """Most of the darkest background pixel's light that may be stray."""
 CEILING = -5.1
 """Highest z [mm] of an LED: below gel and a plate of 1 mm, so that a slab stays possible."""
+VIRTUAL_CEILING = -0.6
+"""Highest z [mm] of a virtual source, over the coat at rest: LEDs have some height (a guess)."""
 HEIGHT = 6
 """Column of a row of ``LightParameters.leds`` that has the height of the emitting face."""
 HEIGHTS = 0.1, 6.0
 """Range of a fitted height [mm]: from an LED to a light guide as high as a wall (a guess)."""
+LOWEST_START, HIGHEST_START = -30.0, -0.6
+"""Range of heights z [mm] where rows of LEDs may begin."""
 SPREAD = 1.5
 """Width over which an LED is split, over its own: with its neighbours a row (a guess)."""
 REFERENCE_DISTANCE = 10e-3
@@ -74,6 +78,11 @@ class LightParameters:
     def layer(self) -> np.ndarray:
         """Index in ``CHANNELS`` of every LED's layer, (L,)."""
         return np.array([CHANNELS.index(led.layer) for led in self.template.leds])
+
+    @property
+    def virtual(self) -> np.ndarray:
+        """True for virtual sources, (L,)."""
+        return np.array([led.virtual for led in self.template.leds])
 
     def lights(self, sensor: SensorSpec) -> LightsSpec:
         """The light file, for the coat and exposure of ``sensor``."""
@@ -176,6 +185,35 @@ def leds_at_walls(sensor: SensorSpec, sides: str) -> LightsSpec:
                 )
             )
     return LightsSpec(tuple(leds))
+
+
+def leds_in_rows(lights: LightsSpec, heights: str | None, *, virtual: bool) -> LightsSpec:
+    """Start of a fit: the LEDs in rows, one over the other, their powers shared.
+
+    ``heights``: numbers joined by commas, z of the rows [mm]; None is one row where the LEDs are. ``virtual`` declares them so. Raises
+    InputError for what is no such text, and heights outside ``LOWEST_START`` to ``HIGHEST_START``.
+    """
+    if heights is None:
+        return dataclasses.replace(lights, leds=tuple(dataclasses.replace(led, virtual=virtual) for led in lights.leds))
+    rule = f"must be numbers in [{LOWEST_START:g}, {HIGHEST_START:g}] joined by commas, as in -3.5,-9"
+    try:
+        rows = [float(part) for part in heights.split(",")]
+    except ValueError:
+        raise InputError("heights", value=heights, rule=rule) from None
+    if not all(LOWEST_START <= z <= HIGHEST_START for z in rows):
+        raise InputError("heights", value=heights, rule=rule)
+    leds = [
+        dataclasses.replace(
+            led,
+            name=led.name if len(rows) == 1 else f"{led.name}_row_{k + 1}",
+            position=(*led.position[:2], z / 1e3),
+            power=tuple(p / len(rows) for p in led.power),
+            virtual=virtual,
+        )
+        for led in lights.leds
+        for k, z in enumerate(rows)
+    ]
+    return dataclasses.replace(lights, leds=tuple(leds))
 
 
 PLACE, AIM, LOBE, TALL, POWER = 1.0, 0.2, 1.0, 0.5, 0.2

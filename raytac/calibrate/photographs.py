@@ -71,7 +71,7 @@ def photographs_of(presses: RealPresses, sensor: SensorSpec) -> Photographs:
     Those at the border are among them, as ``Photographs.fully_visible`` says. All must have a circle.
     """
     if presses.resolution != sensor.camera.resolution:
-        rule = f"must have images of the sensor's size, {sensor.camera.resolution}"
+        rule = f"must have images of the sensor's size, {sensor.camera.resolution}, or say --pixel-mm"
         raise InputError("data", value=presses.resolution, rule=rule)
     if not presses.fully_visible.any():
         raise InputError("data", value="0 presses", rule="must hold a press whose contact circle lies in the image")

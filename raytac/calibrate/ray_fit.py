@@ -37,6 +37,10 @@ STEPS = {0: 0.4, 1: 0.4, 2: 0.4, HEIGHT: 0.5}
 """Steps [mm] of slopes by an LED's place and height; shadows' soft edges are as wide."""
 FEWEST = 4
 """Fewest presses that a fit takes."""
+HOLD, HOLD_FACTOR = 1000.0, 8.0
+"""First stiffness [levels²/σ²] of LEDs to the best state after a round that made the cost worse.
+
+Such rounds raise it by the factor, others lower it (Levenberg and Marquardt's rule, between rounds)."""
 ENVS = 16
 """Presses in one call of the ray tracer."""
 
@@ -50,7 +54,7 @@ class Fitted:
     state: FitState
     costs: tuple[float, ...]
     """Cost with the ray tracer's light before the first round and after every one.
-    The least is taken; without rounds that with direct light alone."""
+    The least is taken, and the round after a worse one begins there; without rounds that with direct light alone."""
     start_errors: tuple[float, ...]
     """Mean absolute residual [levels] in the contacts after direct light from every start."""
 
@@ -159,19 +163,23 @@ def fit_lights(
         results.append((problem.cost(here, off), here))
         errors.append(float(np.abs(off[0][problem.inside]).mean()))
     _, state = min(results, key=lambda pair: pair[0])
-    grid, passed = make_grid(sensor.gelpad, GRID_PITCH), []
-    # A round's cost is known when the next one has rendered its result: the light that it was solved with is of first order only.
-    for k in range(rounds):
-        extra = extra_light(problem, state, grid, device, tracing or RayTraced())
+    grid, costs, hold = make_grid(sensor.gelpad, GRID_PITCH), [], 0.0
+    if not rounds:
+        costs.append(problem.cost(state, problem.residuals(state)))
+    # A round's cost is known when its result has been rendered: the light that it was solved with is of first order only.
+    best = problem, state
+    for k in range(rounds + bool(rounds)):
+        extra = extra_light(problem, state, grid, device, tracing or RayTraced(), slopes=k < rounds)
         problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, extra=extra, seed=seed)
-        passed.append((problem.cost(state, problem.residuals(state)), state))
-        state = problem.solve(state, LATER, report(f"all light, round {k + 1} of {rounds}"))
-    if rounds:
-        extra = extra_light(problem, state, grid, device, tracing or RayTraced(), slopes=False)
-        problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, extra=extra, seed=seed)
-    passed.append((problem.cost(state, problem.residuals(state)), state))
-    _, state = min(passed, key=lambda pair: pair[0])
-    costs = [cost for cost, _ in passed]
+        costs.append(problem.cost(state, problem.residuals(state)))
+        if costs[-1] <= min(costs):
+            best, hold = (problem, state), hold / HOLD_FACTOR
+        else:  # too long a step: from the best state again, its LEDs held nearer to where they are
+            hold = max(HOLD, HOLD_FACTOR * hold)
+        if k < rounds:
+            held = best[0].near(best[1], hold)
+            state = held.solve(best[1], LATER, report(f"all light, round {k + 1} of {rounds}"))
+    _, state = best
     return Fitted(with_parameters(sensor, state.p, shots.background), state, tuple(costs), tuple(errors))
 
 

@@ -28,6 +28,10 @@ _OF_DATA = (
     "rounds",
     "prior",
     "border",
+    "pixel_mm",
+    "own_response",
+    "heights",
+    "virtual",
     "drift",
 )
 _OF_MARKERS = ("level", "quick", "verbose")

@@ -98,6 +98,7 @@ LED_SCHEMA: Final[Schema] = {
     "lobe": Number("[1, 1000]"),
     "power_w_per_sr": Number("[0, 1e6]", length=3),
     "glow_per_m2": Number("[0, 1e6]", default=0.0),
+    "virtual": Flag(default=False),
 }
 """Keys of one ``[[led]]`` table."""
 
@@ -338,6 +339,10 @@ class LedSpec:
     """On-axis intensity by channel (linear RGB) [W/sr, relative], as of a point light."""
     glow: float = 0.0
     """Even radiance of walls and floor over ``power`` [1/m²]: light scattered many times."""
+    virtual: bool = False
+    """True declares a source that stands for light which entered gel and plate at their sides.
+
+    It may lie beside the camera's view up to the coat at rest, where no LED fits."""
 
     def __post_init__(self) -> None:
         check_fields(vars(self), LED_SCHEMA, "led")

@@ -24,8 +24,8 @@ def validate_sensor(sensor: SensorSpec) -> None:
     Raises:
         SpecError: the dome is deeper than the pad; the camera lies in the gel, outside the case, or sees past the pad; the
             vignette leaves no light; colour shading has a wrong number of coefficients or might overflow; markers lie off the pad; an
-            LED lies in the gel, above the dome, or outside the case; with ``refraction.model = "slab"``, camera or LED do not lie
-            below the slab's face to the air.
+            LED lies in the gel, above the dome, or outside the case, a virtual one above the dome, in the camera's view or where
+            light refracts; with ``refraction.model = "slab"``, camera or LED do not lie below the slab's face to the air.
             The message names the file that the sensor or its lights came from, the key, and the value in the unit of the file.
     """
     _check_dome(sensor)
@@ -172,18 +172,52 @@ def _check_markers(sensor: SensorSpec) -> None:
 def _check_led(sensor: SensorSpec, index: int, led: LedSpec) -> None:
     pad, back = sensor.gelpad, _back_face(sensor)
     half_x, half_y = pad.size[0] / 2, pad.size[1] / 2
+    if led.virtual:
+        _check_virtual(sensor, index, led)
     for x, y, z in (led.position, *led_corners(led)):
         rest = -pad.sag(min(abs(x), half_x), min(abs(y), half_y))
-        if abs(x) <= half_x and abs(y) <= half_y and z > -back + _SLACK:
+        if not led.virtual and abs(x) <= half_x and abs(y) <= half_y and z > -back + _SLACK:
             rule = f" lies inside the gel: under the pad all of it must have z <= {-back * 1e3:.4g} mm"
         elif z > rest + _SLACK:
-            rule = f" lies above the dome: beside the pad all of it must have z <= {rest * 1e3:.4g} mm"
+            rule = (
+                f" lies above the dome: {'all' if led.virtual else 'beside the pad all'} of it must have z <= {rest * 1e3:.4g} mm"
+            )
         elif not _in_case(sensor, (x, y, z)):
             rule = f", {in_mm(led.size)} mm large, must lie inside the case, {_case_rule(sensor)}"
         else:
             continue
         key = f"led[{index}].position_mm"
         raise SpecError(f"LED {led.name!r}{rule}", file=sensor.lights.source, key=key, value=in_mm(led.position))
+
+
+def view_edges(sensor: SensorSpec) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Lowest and highest x, then y, of the camera's view of z = 0 [m]; below it is narrower."""
+    camera = sensor.camera
+    x, y = (
+        (at - principal * pitch, at + (count - principal) * pitch)
+        for at, principal, pitch, count in zip(
+            camera.position[:2], camera.principal_point, camera.pixel_pitch, camera.resolution, strict=True
+        )
+    )
+    return x, y
+
+
+def _check_virtual(sensor: SensorSpec, index: int, led: LedSpec) -> None:
+    key = f"led[{index}].virtual"
+    if sensor.refraction.model != "none":
+        rule = f"LED {led.name!r} is virtual: refraction.model must be 'none', since its light is in the gel already"
+        raise SpecError(rule, file=sensor.lights.source, key=key, value=True)
+    corners = led_corners(led)
+    beside = any(
+        max(corner[axis] for corner in corners) <= low + _SLACK or min(corner[axis] for corner in corners) >= high - _SLACK
+        for axis, (low, high) in enumerate(view_edges(sensor))
+    )
+    if not beside:
+        edges = ", ".join(
+            f"{name} = {low * 1e3:.4g} to {high * 1e3:.4g}" for name, (low, high) in zip("xy", view_edges(sensor), strict=True)
+        )
+        rule = f"LED {led.name!r} is virtual: all of it must lie beside the camera's view, {edges} mm"
+        raise SpecError(rule, file=sensor.lights.source, key=f"led[{index}].position_mm", value=in_mm(led.position))
 
 
 def led_corners(led: LedSpec) -> tuple[Vec3, Vec3, Vec3, Vec3]:

@@ -140,7 +140,9 @@ def lights_text(lights: LightsSpec, comment: str) -> str:
     tables = [
         f'[[led]]\nname = "{led.name}"\nlayer = "{led.layer}"\nposition_mm = [{row(led.position, 1e3, ".2f")}]\n'
         f"axis = [{row(led.axis, 1, '.4f')}]\nsize_mm = [{row(led.size, 1e3, '.2f')}]\nlobe = {led.lobe:.2f}\n"
-        f"power_w_per_sr = [{row(led.power, 1, '.3e')}]\n" + (f"glow_per_m2 = {led.glow:.4g}\n" if led.glow else "")
+        f"power_w_per_sr = [{row(led.power, 1, '.3e')}]\n"
+        + (f"glow_per_m2 = {led.glow:.4g}\n" if led.glow else "")
+        + ("virtual = true\n" if led.virtual else "")
         for led in lights.leds
     ]
     return "\n".join([*(f"# {line}" for line in comment.splitlines()), "", "\n".join(tables)])

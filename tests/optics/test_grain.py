@@ -51,7 +51,8 @@ def test_draws_of_an_environment_do_not_depend_on_the_others(grainy: SensorSpec)
 def test_images_of_a_press_have_grain_on_request(grainy: SensorSpec) -> None:
     settings = {"resolution": (160, 120), "device": "cpu", "outputs": ("rgb", "layers")}
     clean, noisy, again = (
-        TactileSensor(grainy, noise=noise, **settings).press("sphere") for noise in (False, True, True)  # type: ignore[arg-type]
+        TactileSensor(grainy, noise=noise, **settings).press("sphere")
+        for noise in (False, True, True)  # type: ignore[arg-type]
     )
     np.testing.assert_array_equal(noisy.rgb, again.rgb)
     off = noisy.rgb.astype(float) - clean.rgb

@@ -18,7 +18,7 @@ from raytac.io.code_digest import code_digest
 from raytac.optics.taxim.bake.settings import BakeSettings
 from raytac.optics.taxim.folder import load_calibration, save_calibration
 from raytac.optics.taxim.table import PolyTable
-from raytac.specs.sensor import MarkerSpec, SensorSpec
+from raytac.specs.sensor import MarkerSpec, NoiseSpec, SensorSpec
 
 NO_MARKERS = MarkerSpec(0, 0, (0.0, 0.0), (0.0, 0.0), 0.0, 0.0)
 
@@ -29,11 +29,10 @@ CHECKSUMS = "SHA256SUMS"
 def table_key(sensor: SensorSpec, settings: BakeSettings, seed: int, resolution: tuple[int, int]) -> str:
     """Digest of sensor and lights (not of where their files lie), settings and baking code.
 
-    Device and markers are not in it: sensors that differ in their dots alone share a table, which is baked on a plain coat.
+    Device, markers and grain are not in it: sensors that differ in these alone share a table, which is baked on a plain coat.
     """
-    plain = replace(
-        sensor, source=None, name="", lights=replace(sensor.lights, source=None), marker_motion=None, markers=NO_MARKERS
-    )
+    lights = replace(sensor.lights, source=None)
+    plain = replace(sensor, source=None, name="", lights=lights, marker_motion=None, markers=NO_MARKERS, noise=NoiseSpec())
     basis = plain, settings, seed, resolution, code_digest("raytac.optics.taxim.bake.bake")
     return hashlib.sha256(repr(basis).encode()).hexdigest()[:24]
 
