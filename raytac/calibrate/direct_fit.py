@@ -49,6 +49,8 @@ SIGMA = {
 """Standard deviation of a parameter about its start [mm, rad, 1 or full scales]."""
 CIRCLE_SIGMA = np.array([1.0, 1.0, 1.5]) / 320
 """Standard deviation of a circle's x, y and radius about its label, over the image's width."""
+BORDER_SIGMA = 4.0
+"""That of a circle which leaves the image, over that of the others: labels are worse there."""
 CIRCLE_PRIOR = 300.0
 """Squared residual [levels²] that a circle's deviation of one sigma is worth."""
 ACTIVE = 6
@@ -134,7 +136,8 @@ class DirectFit:
         self.extra, self.shape = extra, (height, width)
         # Images depend on the heights of LEDs by shadows alone.
         self._sees_heights = extra is not None and HEIGHT in extra.by_led
-        self.circle_sigma = CIRCLE_SIGMA * native[0]
+        wider = np.where(shots.fully_visible, 1.0, BORDER_SIGMA)[:, None]
+        self.circle_sigma = CIRCLE_SIGMA * native[0] * wider
         self.ties = side_ties(start.p, len(self.flat(start)))
         self.anchor, self.hold = self.flat(start), 0.0
 
@@ -374,11 +377,11 @@ class DirectFit:
         for k in range(count):
             a, b = slice(first[k], first[k + 1]), slice(size + 3 * k, size + 3 * k + 3)
             weighted = circles[a].T * w[a]
-            normal[b, b] = weighted @ circles[a] + np.diag(CIRCLE_PRIOR / self.circle_sigma**2)
+            normal[b, b] = weighted @ circles[a] + np.diag(CIRCLE_PRIOR / self.circle_sigma[k] ** 2)
             normal[b, :size] = weighted @ jac[a]
             normal[:size, b] = normal[b, :size].T
             slope[b] = (
-                weighted @ off.ravel()[a] + CIRCLE_PRIOR * (state.circles[k] - self.shots.circles[k]) / self.circle_sigma**2
+                weighted @ off.ravel()[a] + CIRCLE_PRIOR * (state.circles[k] - self.shots.circles[k]) / self.circle_sigma[k] ** 2
             )
         pushed = self.at(x - 1e-9 * np.sign(slope[:size]), state.circles)
         stuck = np.abs(self.flat(self.inside_bounds(pushed)) - self.flat(pushed)) > 1e-12
