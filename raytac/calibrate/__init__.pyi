@@ -2,9 +2,9 @@ from .direct_fit import FitSettings as FitSettings
 from .fit_models import Models as Models
 from .fit_models import fit_models as fit_models
 from .fit_models import images_of as images_of
-from .light_parameters import leds_at_walls as leds_at_walls
 from .photographs import Photographs as Photographs
 from .photographs import read_photographs as read_photographs
 from .presses import RealPresses as RealPresses
 from .presses import by_press as by_press
 from .presses import read_presses as read_presses
+from .start import leds_at_walls as leds_at_walls

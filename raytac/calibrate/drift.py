@@ -1,4 +1,4 @@
-"""Session drift: how a photograph's levels differ from the image at rest where nothing touches.
+"""Session drift: gains and offsets of photographs against the image at rest.
 
 A camera's gains wander from day to day and while it warms up. Pixels far from a contact see the coat at rest, so that they tell how
 a photograph I of one press differs from the image at rest B, a gain g and an offset o a channel:
@@ -23,7 +23,7 @@ BLOCK = 8
 FEWEST_BLOCKS = 30
 """Fewest squares that tell gain and offset; a photograph with fewer counts as steady."""
 CLIP = 3.0
-"""Squares this many standard deviations off are left out once: dust, or a shadow that reaches far."""
+"""Squares so many standard deviations off are left out once: dust, or a long shadow."""
 GAIN_SIGMA = 0.1
 """Standard deviation of gains about 1 before the data, which matters where B is nearly even."""
 ROUNDS = 3
@@ -135,7 +135,7 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 
 
 def _blocks(image: np.ndarray) -> np.ndarray:
-    """Means (K, C) over the squares of an image (H, W, C); what is over at the edges is left out."""
+    """Means (K, C) over the whole squares of an image (H, W, C)."""
     height, width, channels = image.shape
     rows, columns = height // BLOCK, width // BLOCK
     cut = image[: rows * BLOCK, : columns * BLOCK].astype(float)

@@ -14,28 +14,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from raytac.calibrate.photographs import decode
-from raytac.checks import check_whole
 from raytac.errors import InputError
-from raytac.specs import LedSpec, LightsSpec, SensorSpec
-from raytac.specs.sensor_check import led_corners
+from raytac.specs import LightsSpec, SensorSpec
 
 CHANNELS = ("red", "green", "blue")
-SIDES = {"red": (0.0, -1.0), "green": (1.0, 0.0), "blue": (0.0, 1.0)}
-"""Outward direction (x, y) of the wall that the LEDs of a layer start at."""
 DARKEST = 0.85
 """Most of the darkest background pixel's light that may be stray."""
 CEILING = -5.1
 """Highest z [mm] of an LED: below gel and a plate of 1 mm, so that a slab stays possible."""
 VIRTUAL_CEILING = -0.6
-"""Highest z [mm] of a virtual source, over the coat at rest: LEDs have some height (a guess)."""
+"""Highest z [mm] of a virtual source over the coat at rest (a guess)."""
 HEIGHT = 6
 """Column of a row of ``LightParameters.leds`` that has the height of the emitting face."""
 HEIGHTS = 0.1, 6.0
 """Range of a fitted height [mm]: from an LED to a light guide as high as a wall (a guess)."""
-LOWEST_START, HIGHEST_START = -30.0, -0.6
-"""Range of heights z [mm] where rows of LEDs may begin."""
-SPREAD = 1.5
-"""Width over which an LED is split, over its own: with its neighbours a row (a guess)."""
 REFERENCE_DISTANCE = 10e-3
 """Distance [m] at which a power of 1 gives a coat facing the LED full scale."""
 
@@ -126,94 +118,6 @@ def with_parameters(sensor: SensorSpec, p: LightParameters, background: np.ndarr
 def darkest(background: np.ndarray, gamma: float) -> np.ndarray:
     """Linear light of the darkest pixel of every channel, (3,)."""
     return np.maximum(decode(background.reshape(-1, 3).min(0), gamma), 1e-6)
-
-
-def leds_split(sensor: SensorSpec, count: int) -> LightsSpec:
-    """Start of a fit: ``count`` LEDs in place of each of the sensor's own.
-
-    They stand side by side over ``SPREAD`` times its width. What would stick out of the case's walls is moved inside. Raises InputError
-    unless ``count`` is a whole number >= 1.
-    """
-    count = check_whole("split", count)
-    if count == 1:
-        return sensor.lights
-    half, leds = 0.5 * np.array(sensor.case.size), []
-    for led in sensor.lights.leds:
-        width, along = SPREAD * led.size[0], np.array(led.edges[0])
-        for k in range(count):
-            place = np.array(led.position) + ((k + 0.5) / count - 0.5) * width * along
-            part = dataclasses.replace(
-                led,
-                name=f"{led.name}_{k + 1}",
-                position=tuple(map(float, place)),
-                size=(width / count, led.size[1]),
-                power=tuple(p / count for p in led.power),
-            )
-            corners = np.array(led_corners(part))[:, :2]
-            inwards = np.maximum(-half - corners.min(0), 0) - np.maximum(corners.max(0) - half, 0)
-            x, y, z = part.position
-            leds.append(dataclasses.replace(part, position=(x + float(inwards[0]), y + float(inwards[1]), z)))
-    return dataclasses.replace(sensor.lights, leds=tuple(leds))
-
-
-def leds_at_walls(sensor: SensorSpec, sides: str) -> LightsSpec:
-    """Start of a fit: LEDs along the walls, near the gel's height.
-
-    They are aimed across the pad and towards the camera. Raises InputError unless ``sides`` is three whole numbers >= 1 joined by
-    commas.
-    """
-    counts = sides.split(",")
-    if len(counts) != 3 or not all(count.strip().isdecimal() and int(count) for count in counts):
-        raise InputError("sides", value=sides, rule="must be three whole numbers >= 1 joined by commas, as in 3,2,3")
-    half, leds = 0.5 * np.array(sensor.case.size), []
-    for layer, count in zip(CHANNELS, map(int, counts), strict=True):
-        out = np.array(SIDES[layer])
-        own = np.eye(3)[CHANNELS.index(layer)]
-        for k in range(count):
-            along = 0.5 * (2 * k + 1 - count) / max(count, 2) * 2
-            place = out * (half - 2.2e-3) + np.array([abs(out[1]), abs(out[0])]) * along * half * 0.8
-            axis = np.array([*(-0.95 * out), -0.3])
-            leds.append(
-                LedSpec(
-                    name=f"{layer}_{k + 1}",
-                    layer=layer,
-                    position=(float(place[0]), float(place[1]), -7.0e-3),
-                    axis=tuple(map(float, axis / np.linalg.norm(axis))),  # type: ignore[arg-type]
-                    size=(2.0e-3, 1.0e-3),
-                    lobe=2.5,
-                    power=tuple(map(float, 5e-5 / count * own)),  # type: ignore[arg-type]
-                )
-            )
-    return LightsSpec(tuple(leds))
-
-
-def leds_in_rows(lights: LightsSpec, heights: str | None, *, virtual: bool) -> LightsSpec:
-    """Start of a fit: the LEDs in rows, one over the other, their powers shared.
-
-    ``heights``: numbers joined by commas, z of the rows [mm]; None is one row where the LEDs are. ``virtual`` declares them so. Raises
-    InputError for what is no such text, and heights outside ``LOWEST_START`` to ``HIGHEST_START``.
-    """
-    if heights is None:
-        return dataclasses.replace(lights, leds=tuple(dataclasses.replace(led, virtual=virtual) for led in lights.leds))
-    rule = f"must be numbers in [{LOWEST_START:g}, {HIGHEST_START:g}] joined by commas, as in -3.5,-9"
-    try:
-        rows = [float(part) for part in heights.split(",")]
-    except ValueError:
-        raise InputError("heights", value=heights, rule=rule) from None
-    if not all(LOWEST_START <= z <= HIGHEST_START for z in rows):
-        raise InputError("heights", value=heights, rule=rule)
-    leds = [
-        dataclasses.replace(
-            led,
-            name=led.name if len(rows) == 1 else f"{led.name}_row_{k + 1}",
-            position=(*led.position[:2], z / 1e3),
-            power=tuple(p / len(rows) for p in led.power),
-            virtual=virtual,
-        )
-        for led in lights.leds
-        for k, z in enumerate(rows)
-    ]
-    return dataclasses.replace(lights, leds=tuple(leds))
 
 
 PLACE, AIM, LOBE, TALL, POWER = 1.0, 0.2, 1.0, 0.5, 0.2

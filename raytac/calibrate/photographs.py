@@ -66,9 +66,9 @@ def decode(levels: np.ndarray, gamma: float) -> np.ndarray:
 
 
 def photographs_of(presses: RealPresses, sensor: SensorSpec) -> Photographs:
-    """Presses at the sensor's resolution; InputError for other sizes, or none that is fully visible.
+    """Presses at the sensor's resolution, those at the border among them; all have a circle.
 
-    Those at the border are among them, as ``Photographs.fully_visible`` says. All must have a circle.
+    Raises InputError for other sizes, or none that is fully visible.
     """
     if presses.resolution != sensor.camera.resolution:
         rule = f"must have images of the sensor's size, {sensor.camera.resolution}, or say --pixel-mm"

@@ -38,9 +38,9 @@ STEPS = {0: 0.4, 1: 0.4, 2: 0.4, HEIGHT: 0.5}
 FEWEST = 4
 """Fewest presses that a fit takes."""
 HOLD, HOLD_FACTOR = 1000.0, 8.0
-"""First stiffness [levels²/σ²] of LEDs to the best state after a round that made the cost worse.
+"""First stiffness [levels²/σ²] of LEDs to the best state, and its factor.
 
-Such rounds raise it by the factor, others lower it (Levenberg and Marquardt's rule, between rounds)."""
+Rounds that make the cost worse raise it by the factor, others lower it (Levenberg and Marquardt's rule, between rounds)."""
 ENVS = 16
 """Presses in one call of the ray tracer."""
 

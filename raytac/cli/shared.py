@@ -11,11 +11,10 @@ import numpy as np
 import tyro
 
 from raytac.calibrate.circles import with_found_circles
-from raytac.calibrate.light_parameters import leds_at_walls, leds_in_rows, leds_split
 from raytac.calibrate.photographs import Photographs, photographs_of
 from raytac.calibrate.presses import RealPresses, read_presses
 from raytac.calibrate.prior_choice import INNER, STRENGTHS
-from raytac.calibrate.start import with_first_response, with_images
+from raytac.calibrate.start import leds_at_walls, leds_in_rows, leds_split, with_first_response, with_images
 from raytac.checks import check_known
 from raytac.errors import InputError
 from raytac.io.options import CommonOptions
@@ -119,13 +118,14 @@ class FitOptions(CommonOptions):
 
     LEDs behind a diffuser light like a row."""
     heights: str | None = None
-    """Heights z of rows of LEDs where a fit begins [mm], joined by commas, as in -3.5,-9; each row has all LEDs.
+    """Heights z of rows of LEDs where a fit begins [mm], joined by commas, as in -3.5,-9.
 
-    If not given, one row, at -7 or where the sensor's own are."""
+    Each row has all LEDs. If not given, one row, at -7 or where the sensor's own are."""
     virtual: bool = False
-    """Declare the LEDs virtual sources: light that entered gel and plate at their sides (docs/real-images.md).
+    """Declare the LEDs virtual sources (docs/real-images.md).
 
-    They may lie beside the view up to the coat, which LEDs of glass and metal may not."""
+    They stand for light that entered gel and plate at their sides, and may lie beside the view up to the coat, which LEDs of glass
+    and metal may not."""
     starts: int = 3
     """Starts of a fit of direct light; the best goes on."""
     rounds: int = 3
@@ -136,7 +136,7 @@ class FitOptions(CommonOptions):
     Or `inner`, which chooses by cross-validation between halves of the pad within the presses that are fitted to."""
 
     pixel_mm: float | None = None
-    """Side of a photograph's pixel on the coat [mm]; needed for images of another size than the sensor's."""
+    """Side of a pixel on the coat [mm]; needed for images of another size than the sensor's."""
     own_response: bool = False
     """Begin from the response of the sensor's file, in place of gamma 1.4 without stray light.
 
@@ -144,7 +144,9 @@ class FitOptions(CommonOptions):
     border: bool = True
     """Also fit presses whose labelled circle leaves the image; they are tested apart."""
     drift: bool = True
-    """Take session drift from every photograph: a gain and an offset a channel, measured where no press reaches."""
+    """Take session drift from every photograph: a gain and an offset a channel.
+
+    They are measured where no press reaches."""
 
     @property
     def chosen_prior(self) -> str | None:

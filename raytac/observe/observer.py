@@ -21,6 +21,7 @@ from raytac.observe.settings import ObservationSettings, image_layout
 from raytac.observe.spaces import ArraySpec, array_specs
 from raytac.optics.base import BuiltOptics
 from raytac.optics.crop import Cropped
+from raytac.optics.grain import check_grain
 from raytac.optics.registry import chosen_optics
 from raytac.sensor import TactileSensor
 from raytac.specs.sensor import SensorSpec
@@ -69,7 +70,7 @@ class TactileObserver:
 
         Raises:
             InputError: markers of a sensor without, an image too large, a number out of range, or a perturbation of markers that
-                settings and randomization both give.
+                settings and randomization both give, grain of a sensor without.
         """
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
         seed = check_whole("seed", seed, 0)
@@ -79,6 +80,8 @@ class TactileObserver:
         )
         self.sensor = randomised_sensor(sensor_spec(sensor), self.randomization, seed)
         self.num_envs, self.seed = num_envs, seed
+        if self.settings.noise:
+            check_grain(self.sensor)
         self.layout = image_layout(self.sensor, self.settings)
         self.arrays = array_specs(self.sensor, self.settings)
         drifts = "rgb" in self.settings.modalities and self.randomization.changes_images

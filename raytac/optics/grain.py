@@ -7,7 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from raytac.errors import InputError
-from raytac.specs.sensor import SensorSpec
+from raytac.specs.sensor import NoiseSpec, SensorSpec
+
+
+def check_grain(sensor: SensorSpec) -> NoiseSpec:
+    """Noise of a sensor whose images shall have grain; InputError if its file gives none."""
+    if sensor.noise.is_none:
+        rule = f"the sensor {sensor.name!r} has no noise: give its file a [noise] table, as raytac calibrate writes"
+        raise InputError("noise", value=True, rule=rule)
+    return sensor.noise
 
 
 class Grain:
@@ -18,11 +26,8 @@ class Grain:
     """
 
     def __init__(self, sensor: SensorSpec, resolution: tuple[int, int], *, seed: int, batch: int) -> None:
-        """``resolution``: (width, height) [px] of the whole view. InputError: the sensor has no noise."""
-        noise = sensor.noise
-        if noise.is_none:
-            rule = f"the sensor {sensor.name!r} has no noise: give its file a [noise] table, as raytac calibrate writes"
-            raise InputError("noise", value=True, rule=rule)
+        """``resolution``: (width, height) [px] of the whole view. InputError as of ``check_grain``."""
+        noise = check_grain(sensor)
         share = min(1.0, float(np.prod(resolution)) / float(np.prod(sensor.camera.resolution)))
         level = np.arange(256)[:, None] / 255
         dark, bright = np.array(noise.dark_variance), np.array(noise.bright_variance)

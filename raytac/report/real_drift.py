@@ -50,7 +50,7 @@ def session_lines(metrics: Mapping[str, Metric]) -> list[str]:
 
 
 def grain_metrics(noise: NoiseSpec | None, level: float) -> dict[str, Metric]:
-    """Standard deviations [levels] of grain at ``level``, and at the ends of its line; none if unknown."""
+    """Standard deviations [levels] of grain at ``level`` and the ends; none if unknown."""
     if noise is None:
         return {}
     figures: dict[str, Metric] = {"grain.level": level}

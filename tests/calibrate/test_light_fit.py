@@ -10,10 +10,11 @@ import pytest
 from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
 from raytac.calibrate.direct_light import ExtraLight, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
-from raytac.calibrate.light_parameters import HEIGHT, LightParameters, leds_at_walls, leds_split, side_ties, with_parameters
+from raytac.calibrate.light_parameters import HEIGHT, LightParameters, side_ties, with_parameters
 from raytac.calibrate.photographs import Photographs, encode
 from raytac.calibrate.prior_choice import choose_strength
 from raytac.calibrate.ray_fit import extra_light, fit_lights, refine_circles
+from raytac.calibrate.start import leds_at_walls, leds_split
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, make_grid
 from raytac.optics import RayTraced

@@ -10,8 +10,9 @@ import pytest
 
 from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
 from raytac.calibrate.direct_light import ExtraLight, Light
-from raytac.calibrate.light_parameters import CEILING, VIRTUAL_CEILING, leds_at_walls, leds_in_rows
+from raytac.calibrate.light_parameters import CEILING, VIRTUAL_CEILING
 from raytac.calibrate.ray_fit import fit_lights
+from raytac.calibrate.start import leds_at_walls, leds_in_rows
 from raytac.errors import InputError, SpecError
 from raytac.gel.surface import GelSurface, make_grid
 from raytac.optics import RayTraced

@@ -91,6 +91,10 @@ def test_an_observer_hands_the_grain_on(grainy: SensorSpec) -> None:
 def test_a_sensor_without_noise_cannot_have_any() -> None:
     with pytest.raises(InputError, match=r"has no noise: give its file a \[noise\] table"):
         TactileSensor(dataclasses.replace(load_sensor("gelsight_mini"), noise=NoiseSpec()), noise=True)
+    with pytest.raises(InputError, match="has no noise"):
+        TactileObserver(
+            dataclasses.replace(load_sensor("gelsight_mini"), noise=NoiseSpec()), ObservationSettings(("rgb",), noise=True)
+        )
 
 
 def test_noise_is_written_and_read(grainy: SensorSpec, tmp_path: Path) -> None:
