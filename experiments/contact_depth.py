@@ -15,14 +15,12 @@ import numpy as np
 
 from experiments.running import recorded, run
 from raytac import quiet_warp
-from raytac.calibrate.pressed_balls import contact_radius
+from raytac.calibrate import contact_radius
 from raytac.device import resolve_device
 from raytac.gel import ElasticSurround, GelSurface
 from raytac.io import CommonOptions, parse_names
-from raytac.physics import RigidPad, SoftPad
-from raytac.physics.press import PressPad
-from raytac.specs import PADS, load_sensor
-from raytac.specs.press import ObjectSpec, PressScene, StageSpec
+from raytac.physics import PressPad, RigidPad, SoftPad
+from raytac.specs import PADS, ObjectSpec, PressScene, StageSpec, load_sensor
 
 PITCH = 0.06e-3
 """Spacing of the nodes [m]."""
