@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from raytac.cli import main
 from raytac.errors import InputError, SpecError
+from raytac.io.images import read_png
 from raytac.observe import ObservationSettings, TactileObserver
 from raytac.optics.grain import Grain
 from raytac.sensor import TactileSensor
@@ -95,6 +97,28 @@ def test_a_sensor_without_noise_cannot_have_any() -> None:
         TactileObserver(
             dataclasses.replace(load_sensor("gelsight_mini"), noise=NoiseSpec()), ObservationSettings(("rgb",), noise=True)
         )
+
+
+def test_the_command_adds_grain_on_request(grainy: SensorSpec, tmp_path: Path) -> None:
+    for name, text in (sensor_files(grainy) | {"lights.toml": lights_text(grainy.lights, "")}).items():
+        (tmp_path / name).write_text(text, "utf-8")
+    args = [
+        "press",
+        "sphere",
+        "--sensor",
+        str(tmp_path / "sensor.toml"),
+        "--resolution",
+        "64x48",
+        "--outputs",
+        "rgb",
+        "--device",
+        "cpu",
+    ]
+    images = []
+    for more in ([], ["--noise"]):
+        assert main([*args, *more, "--out", str(tmp_path / "out")]) == 0
+        images.append(read_png(tmp_path / "out" / "rgb.png").astype(float))
+    assert 0.2 < (images[1] - images[0]).std() < 1.5
 
 
 def test_noise_is_written_and_read(grainy: SensorSpec, tmp_path: Path) -> None:

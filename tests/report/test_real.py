@@ -14,7 +14,7 @@ from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.fit_models import MODES, fit_models
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.photographs import Photographs
-from raytac.calibrate.presses import by_press
+from raytac.calibrate.presses import RealPresses, by_press
 from raytac.cli import main
 from raytac.cli.calibrate import CalibrateArgs
 from raytac.cli.compare_real import CompareRealArgs
@@ -24,10 +24,10 @@ from raytac.gel.surface import GelSurface, make_grid
 from raytac.io.images import write_png
 from raytac.optics import RayTraced
 from raytac.report.markers import run_calibrate_markers
-from raytac.report.real import RealSettings, table_text
+from raytac.report.real import RealSettings, real_splits, table_text
 from raytac.report.real_calibration import run_calibrate_optics
 from raytac.report.real_imprints import imprint_metrics, imprint_table
-from raytac.report.real_scores import noise_floor, press_scores, summary
+from raytac.report.real_scores import noise_floor, outliers, press_scores, summary
 from raytac.sensor import TactileSensor
 from raytac.specs import load_sensor
 
@@ -210,6 +210,65 @@ def test_imprints_are_means_over_presses_that_reached_their_circle() -> None:
     assert "imprint.ipc.raytrace.contact_mae" not in metrics
     (_, _, row, _) = imprint_table(metrics)
     assert "1 presses without" in row and row.endswith("| 0.900 | 3.00 | 4.00 | 2.00 | 1.00 |")
+
+
+def test_presses_at_the_border_are_split_apart() -> None:
+    """Folds of the others do not depend on them; each is tested once, and only fitted from half to half and shallow to deep."""
+    rng = np.random.default_rng(0)
+    inner = np.column_stack([rng.uniform(60, 260, 20), rng.uniform(60, 180, 20), rng.uniform(20, 40, 20)])
+    edge = np.array([[5.0, 100, 30], [315, 100, 30], [10, 60, 39.9], [160, 2, 20], [310, 200, 45]])
+    circles = np.insert(inner, [3, 3, 9, 15, 20], edge, axis=0)
+    image = np.zeros((240, 320, 3), np.uint8)
+    presses = RealPresses(image, np.repeat(image[None], 25, 0), np.full(25, 4e-3), circles, tuple(map(str, range(25))))
+    whole = presses.fully_visible
+    assert whole.sum() == 20
+    splits = real_splits(presses, whole, RealSettings(folds=5))
+    visible = np.flatnonzero(whole)
+    for (_, (train, test)), (own_train, own_test) in zip(splits[:5], by_press(20, 5), strict=True):
+        np.testing.assert_array_equal(test[whole[test]], visible[own_test])
+        np.testing.assert_array_equal(train[whole[train]], visible[own_train])
+        assert not set(train) & set(test) and len(train) + len(test) == 25
+    tested = np.concatenate([test for _, (_, test) in splits[:5]])
+    assert sorted(tested) == list(range(25))
+    for kind, (_, test) in splits[5:]:
+        assert whole[test].all(), kind
+    kinds = dict(splits[5:])
+    assert circles[kinds["left_right"][0], 0].max() < 160 <= circles[kinds["left_right"][1], 0].min()
+    assert circles[kinds["shallow_deep"][0], 2].max() <= circles[kinds["shallow_deep"][1], 2].min()
+
+
+def test_outliers_are_named_with_their_reasons() -> None:
+    moved = np.array([[0.0, 0, 0], [0, -5, 0], [0, 0, 3.9]])
+    three = Photographs(shots().background, np.zeros((3, 240, 320, 3)), np.full((3, 3), 100.0), np.full(3, 3e-3))
+    found = outliers(["a", "b", "c"], np.array([2.0, 2.2, 5.0]), three.circles + moved, three)
+    assert list(found) == ["b", "c"]
+    assert found["b"] == "its label is 5.0 px from the fitted circle, more than 4"
+    assert found["c"] == "its error in the contact is more than 2 times the median"
+
+
+def test_photographs_of_another_size_need_the_side_of_a_pixel(tmp_path: Path) -> None:
+    """The same command takes them; a fit begins from one response; presses at the border are read with the others."""
+    data = data_set(tmp_path, count=6, radius=40.0, shape=(480, 640))
+    with pytest.raises(InputError, match="say --pixel-mm"):
+        read_data(data, "gelsight_mini", None, "1,1,1")
+    spec, presses, photographs, said = read_data(data, "gelsight_mini", None, "1,1,1", pixel_mm=0.03)
+    assert spec.camera.resolution == (640, 480) and spec.camera.pixel_pitch == pytest.approx((0.03e-3, 0.03e-3))
+    assert spec.camera.principal_point == (320.0, 240.0) and len(presses) == len(photographs.presses) == 6 and not said
+    assert spec.response.gamma == 1.4 and not any(spec.response.black_level) and not any(map(len, spec.response.shading))
+    own = read_data(data, "gelsight_mini", None, "1,1,1", pixel_mm=0.03, own_response=True)[0]
+    assert own.response == SENSOR.response
+    with pytest.raises(InputError, match=r"in \(0, 1\) mm"):
+        read_data(data, "gelsight_mini", None, "1,1,1", pixel_mm=30.0)
+    wide = tmp_path / "wide"
+    wide.mkdir()
+    with pytest.raises(InputError, match="sides are as 320 to 240"):
+        read_data(data_set(wide, count=6, shape=(240, 640)), "gelsight_mini", None, "1,1,1", pixel_mm=0.03)
+    rows = (data / "labels.csv").read_text("utf-8").replace("6.310mm,0,100,100", "6.310mm,0,10,100")
+    (data / "labels.csv").write_text(rows, "utf-8")
+    _, presses, photographs, _ = read_data(data, "gelsight_mini", None, "1,1,1", pixel_mm=0.03)
+    assert photographs.fully_visible.tolist() == [False] + [True] * 5
+    _, presses, _, said = read_data(data, "gelsight_mini", None, "1,1,1", pixel_mm=0.03, border=False)
+    assert len(presses) == 5 and said == {"6.310mm_00": "not used: it is not fully visible"}
 
 
 def test_folds_test_every_press_once() -> None:
