@@ -185,13 +185,15 @@ class TaskBatch:
     # --- episodes --------------------------------------------------------------------------------------------------------------
 
     def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
-        """Seed the streams of cameras, markers, bodies and mounts for the next ``reset``."""
+        """Seed the streams of cameras, grain, markers, bodies and mounts for the next ``reset``."""
         self._variations.reseed(envs, seeds)
         for i, (name, observer) in enumerate(self.observers.items()):
             sensor_seeds = [sensor_seed(seed, i) for seed in seeds]
             observer.reseed(envs, sensor_seeds)
             if observer.settings.needs_markers:
                 self.world.sensors[name].marker_tracker.reseed(envs, sensor_seeds)
+            if observer.settings.noise:
+                self.world.sensors[name].reseed_noise(envs, sensor_seeds)
 
     def reset(self, envs: Sequence[int], rngs: Sequence[np.random.Generator]) -> dict[str, np.ndarray]:
         """Begin episodes in ``envs``, each with its generator; returns all observations (B, …)."""

@@ -242,9 +242,8 @@ class TactileSensor:
         self._is_narrow = False
         if own_seeds is not None and self.markers is not None:
             self.marker_tracker.reseed(range(self.num_envs), own_seeds)
-        if own_seeds is not None and self._grain is not None:
-            for env, own_seed in enumerate(own_seeds):
-                self._grain.reseed(env, own_seed)
+        if own_seeds is not None:
+            self.reseed_noise(range(self.num_envs), own_seeds)
         if self._tracker is not None:
             self._tracker.reset()
         return self._pad
@@ -385,6 +384,12 @@ class TactileSensor:
         Raises ``InputError``: no marker model was asked for, or an environment that does not exist.
         """
         self.marker_tracker.reset(envs)
+
+    def reseed_noise(self, envs: Iterable[int], seeds: Iterable[int]) -> None:
+        """Seed the grain of environments, each as that of a single one; none without ``noise``."""
+        if self._grain is not None:
+            for env, own_seed in zip(envs, seeds, strict=True):
+                self._grain.reseed(env, own_seed)
 
     def _followed(self, readings: Iterable[PadReading]) -> Iterator[PadReading]:
         """The same readings, while markers that need it see every one of them."""

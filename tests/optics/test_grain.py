@@ -10,6 +10,7 @@ import pytest
 
 from raytac.cli import main
 from raytac.errors import InputError, SpecError
+from raytac.gel.surface import GelSurface
 from raytac.io.images import read_png
 from raytac.observe import ObservationSettings, TactileObserver
 from raytac.optics.grain import Grain
@@ -73,6 +74,18 @@ def test_successive_frames_differ_and_seeds_repeat_them(grainy: SensorSpec) -> N
     np.testing.assert_array_equal(first, second)
     third = sensor.press("sphere").rgb
     assert (third != second).mean() > 0.3 and (first[0] != first[1]).mean() > 0.3
+
+
+def test_a_seeded_environment_has_the_grain_of_a_single_one(grainy: SensorSpec) -> None:
+    """Whichever of a batch it is, and whatever the others do."""
+    many, one = (TactileSensor(grainy, noise=True, resolution=(64, 48), device="cpu", num_envs=count) for count in (3, 1))
+    many.reseed_noise([2], [9])
+    one.reseed_noise([0], [9])
+    surface, alone = (GelSurface.at_rest(sensor.grid) for sensor in (many, one))
+    for _ in range(2):
+        row, single = many.update(surface, [2]).rgb, one.update(alone, [0]).rgb
+        np.testing.assert_array_equal(row, single)
+    TactileSensor(grainy, device="cpu").reseed_noise([0], [1])
 
 
 def test_an_observer_hands_the_grain_on(grainy: SensorSpec) -> None:
