@@ -57,15 +57,16 @@ def test_images_of_a_press_have_grain_on_request(grainy: SensorSpec) -> None:
         TactileSensor(grainy, noise=noise, **settings).press("sphere")
         for noise in (False, True, True)  # type: ignore[arg-type]
     )
-    np.testing.assert_array_equal(noisy.rgb, again.rgb)
+    assert (noisy.rgb != again.rgb).mean() < 1e-3, "one draw; rounding of the renderer may flip a level"
     off = noisy.rgb.astype(float) - clean.rgb
     level = clean.rgb.astype(float)
     sigma = np.sqrt(0.25 * (np.array(DARK) + (np.array(BRIGHT) - np.array(DARK)) * level / 255) + 1 / 12)
     assert (off / sigma).std() == pytest.approx(1, abs=0.02)
     for name, layer in clean.layers.items():
-        np.testing.assert_array_equal(noisy.layers[name], layer)
+        np.testing.assert_allclose(noisy.layers[name], layer, rtol=1e-4, atol=1e-7, err_msg="rounding alone")
     sensor = TactileSensor(grainy, noise=True, **settings)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(sensor.rest().rgb, TactileSensor(grainy, **settings).rest().rgb)  # type: ignore[arg-type]
+    rest, plain = sensor.rest().rgb, TactileSensor(grainy, **settings).rest().rgb  # type: ignore[arg-type]
+    assert (rest != plain).mean() < 1e-3, "no grain in the image at rest"
 
 
 def test_successive_frames_differ_and_seeds_repeat_them(grainy: SensorSpec) -> None:
