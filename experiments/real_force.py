@@ -1,20 +1,22 @@
-"""How near are the pads' forces to those that a real sensor was measured to bear? Force against depth of a ball: rigid pad, soft pad's levels.
+"""How near are the pads' forces to those that a real sensor bears? Force against depth of a ball: rigid pad and levels of the soft pad.
 
     python experiments/real_force.py feats_force.csv --radius-mm 7.5 --out runs/real_force
-    python experiments/real_force.py feats_force.csv --radius-mm 7.5 --levels coarse,medium,fine --out runs/real_force
+    python experiments/real_force.py feats_force.csv --radius-mm 7.5 --poisson-ratios 0.4,0.45 --frictions 0 --out runs/real_force
 
 The file has columns ``depth_mm`` and ``force_n``; lines that begin with # are skipped. A depth is the travel from first touch. Keys:
 
 - ``force.DEPTH.measured_n``, ``force.PAD.DEPTH.n``, ``….error``: force of a pad [N], and over the measured one, less 1.
 - ``force.PAD.DEPTH.held_out_error``: the same with Young's modulus times one factor, fitted to the **other** depths (least relative
-  squares; forces of a press are proportional to the modulus). ``force.PAD.modulus_factor`` is that of all depths.
+  squares; forces of a press are proportional to the modulus). ``force.PAD.modulus_kpa`` is the modulus fitted to all depths.
 - ``force.PAD.worst``, ``….held_out_worst``: greatest error of any depth.
-- ``force.PAD.poisson_NU.worst`` and ``….modulus_kpa``, with ``--poisson-ratios``: Poisson's ratio another one and the modulus fitted to it.
+- ``force.PAD.poisson_NU.…``, ``force.PAD.friction_MU.…``: the same with another Poisson's ratio or friction than the sensor's. The rigid
+  pad's law knows no friction under a normal load.
 """
 
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -29,7 +31,7 @@ from raytac.errors import InputError, RaytacError
 from raytac.io import CommonOptions, parse_names
 from raytac.physics import RigidPad, SoftPad, quiet_solver
 from raytac.physics.press import PressPad
-from raytac.specs import PADS, SensorSpec, load_sensor
+from raytac.specs import PADS, load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 
 COLUMNS = "depth_mm", "force_n"
@@ -48,7 +50,9 @@ class Args(CommonOptions):
     levels: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(PADS) + "}")] = "coarse,medium"
     """Levels of the soft pad, joined by commas; empty for none."""
     poisson_ratios: str = ""
-    """Poisson's ratios to try besides the sensor's, of the rigid pad, joined by commas."""
+    """Poisson's ratios to try besides the sensor's, joined by commas."""
+    frictions: str = ""
+    """Coefficients of friction to try besides the sensor's, joined by commas."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
 
@@ -85,7 +89,7 @@ def pressed_forces(pad: PressPad, depths: np.ndarray) -> np.ndarray:
     forces = []
     for depth in depths:
         (reading,) = pad.follow(StageSpec("indent", depth=float(depth)))
-        if reading.failed.any() or reading.unconverged is not None and reading.unconverged.any():
+        if reading.failed.any() or (reading.unconverged is not None and reading.unconverged.any()):
             raise RaytacError(f"the press to {1e3 * depth:g} mm did not converge")
         forces.append(float(reading.wrench[0, 2]))
     return np.abs(forces)
@@ -107,56 +111,59 @@ def main(args: Args) -> None:
     check_number("radius_mm", args.radius_mm, "(0, 100]", "mm")
     measured, sensor = Measured.read(args.data), load_sensor(args.sensor)
     levels = parse_names(args.levels, "levels", PADS) if args.levels else ()
-    ratios = [_ratio(text) for text in args.poisson_ratios.split(",") if text.strip()]
+    variants = [("", sensor)]
+    for option, field, text, interval in (
+        ("poisson_ratios", "poisson_ratio", args.poisson_ratios, "[0, 0.5)"),
+        ("frictions", "friction", args.frictions, "[0, 10]"),
+    ):
+        for value in _numbers(option, text, interval):
+            changed = replace(sensor, gelpad=replace(sensor.gelpad, **{field: value}))
+            variants.append((f".{field.removesuffix('_ratio')}_{value:g}", changed))
     device = resolve_device(args.device, ray_tracing=False)
     quiet_solver()
     ball = ObjectSpec("sphere", {"radius": args.radius_mm / 1e3}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)
     scene = PressScene("ball", ball, (StageSpec("indent", depth=float(measured.depth[-1])),))
-
-    def rigid(sensor: SensorSpec) -> np.ndarray:
-        return pressed_forces(RigidPad(sensor, scene, pitch=PITCH), measured.depth)
-
     with recorded(args, "real_force", device=device) as (_, metrics):
-        young = sensor.gelpad.youngs_modulus / 1e3
-        metrics |= {"sensor": sensor.name, "modulus_kpa": young, "poisson_ratio": sensor.gelpad.poisson_ratio}
+        pad = sensor.gelpad
+        metrics |= {"sensor": sensor.name, "modulus_kpa": pad.youngs_modulus / 1e3}
+        metrics |= {"poisson_ratio": pad.poisson_ratio, "friction": pad.friction}
         names = [f"{1e3 * depth:g}" for depth in measured.depth]
         metrics |= {f"force.{name}.measured_n": float(force) for name, force in zip(names, measured.force, strict=True)}
-        print("| pad | " + " | ".join(f"{name} mm" for name in names) + " | worst | modulus fitted to the others: worst | factor |")
+        print(
+            f"| pad | {' | '.join(f'{name} mm' for name in names)} | worst | modulus by the others: worst | modulus by all [kPa] |"
+        )
         print("|" + "---|" * (4 + len(names)))
         print("| measured [N] | " + " | ".join(f"{force:.2f}" for force in measured.force) + " | | | |", flush=True)
-        for pad in ("rigid", *levels):
-            if pad == "rigid":
-                force = rigid(sensor)
-            else:
-                force = pressed_forces(SoftPad(sensor, scene, pitch=PITCH, level=pad, device=device), measured.depth)
-            error, held_out = force / measured.force - 1.0, held_out_errors(force, measured.force)
-            worst, worst_held_out = float(np.abs(error).max()), float(np.abs(held_out).max())
-            factor = modulus_factor(force, measured.force)
-            for k, name in enumerate(names):
-                metrics[f"force.{pad}.{name}.n"] = float(force[k])
-                metrics[f"force.{pad}.{name}.error"] = float(error[k])
-                metrics[f"force.{pad}.{name}.held_out_error"] = float(held_out[k])
-            metrics |= {f"force.{pad}.worst": worst, f"force.{pad}.held_out_worst": worst_held_out}
-            metrics[f"force.{pad}.modulus_factor"] = factor
-            cells = [f"{f:.2f} ({100 * e:+.1f} %)" for f, e in zip(force, error, strict=True)]
-            print(f"| {pad} | {' | '.join(cells)} | {100 * worst:.1f} % | {100 * worst_held_out:.1f} % | {factor:.3f} |", flush=True)
-        for ratio in ratios:
-            force = rigid(replace(sensor, gelpad=replace(sensor.gelpad, poisson_ratio=ratio)))
-            factor = modulus_factor(force, measured.force)
-            worst = float(np.abs(factor * force / measured.force - 1.0).max())
-            metrics[f"force.rigid.poisson_{ratio:g}.worst"] = worst
-            metrics[f"force.rigid.poisson_{ratio:g}.modulus_kpa"] = factor * young
-            print(f"rigid, Poisson's ratio {ratio:g}: worst {100 * worst:.1f} % with a modulus of {factor * young:.0f} kPa", flush=True)
+        for name in ("rigid", *levels):
+            for suffix, own in variants:
+                if name == "rigid":
+                    if suffix.startswith(".friction"):
+                        continue
+                    force = pressed_forces(RigidPad(own, scene, pitch=PITCH), measured.depth)
+                else:
+                    force = pressed_forces(SoftPad(own, scene, pitch=PITCH, level=name, device=device), measured.depth)
+                figures = errors_of(force, measured, names)
+                figures["modulus_kpa"] = modulus_factor(force, measured.force) * pad.youngs_modulus / 1e3
+                metrics |= {f"force.{name}{suffix}.{key}": value for key, value in figures.items()}
+                cells = [f"{figures[f'{depth}.n']:.2f} ({100 * figures[f'{depth}.error']:+.1f} %)" for depth in names]
+                cells += [f"{100 * figures[key]:.1f} %" for key in ("worst", "held_out_worst")]
+                print(f"| {name}{suffix} | {' | '.join(cells)} | {figures['modulus_kpa']:.0f} |", flush=True)
 
 
-def _ratio(text: str) -> float:
+def errors_of(force: np.ndarray, measured: Measured, names: Sequence[str]) -> dict[str, float]:
+    """Forces of a pad and their errors, by the depths' ``names``."""
+    error, held_out = force / measured.force - 1.0, held_out_errors(force, measured.force)
+    figures = {"worst": float(np.abs(error).max()), "held_out_worst": float(np.abs(held_out).max())}
+    for k, name in enumerate(names):
+        figures |= {f"{name}.n": float(force[k]), f"{name}.error": float(error[k]), f"{name}.held_out_error": float(held_out[k])}
+    return figures
+
+
+def _numbers(option: str, text: str, interval: str) -> list[float]:
     try:
-        ratio = float(text)
-    except ValueError:
-        ratio = np.nan
-    if not 0.0 <= ratio < 0.5:
-        raise InputError("poisson_ratios", value=text, rule="must be numbers in [0, 0.5) joined by commas")
-    return ratio
+        return [check_number(option, float(number), interval) for number in text.split(",") if number.strip()]
+    except ValueError as error:
+        raise InputError(option, value=text, rule=f"must be numbers in {interval} joined by commas") from error
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How near do marker models come to a real drag? Dots of two photographs, of a pressed ball and of the same ball dragged, against every model.
+"""How near do marker models come to a real drag? Dots of two photographs, a pressed ball and the same dragged, against every model.
 
     python experiments/real_markers.py fots_markers --circle-px 139,120,38 --ball-radius-mm 3 --pitch-mm 0.0532 --out runs/real_markers
 
@@ -6,9 +6,9 @@ The folder holds ``0.png`` (pressed), ``1.png`` (pressed and dragged), and ``0.c
 ``My`` (a start) and ``dx``, ``dy`` (its motion) [px], a row a dot in the same order. Dots are found again below a pixel as centroids of
 darkness; what is compared is the difference of both photographs.
 
-What a model is told: the circle of the contact in ``0.png`` (read off it, an option), from which the depth follows as the one at which the
-rigid pad's contact is as wide; and the ball's own motion, a displacement and a turn, by the dots within the circle. Nothing else is fitted, unless a
-constant: a displacement that is the same for all dots (a gel that slides in its case), least squares, and taken off the ball's motion too.
+A model is told the circle of the contact in ``0.png``, an option, from which follows the depth, at which the edge of the rigid pad's
+imprint is as wide; and the ball's own motion, a displacement and a turn, by the dots within the circle. Nothing else is fitted, unless a
+constant: a displacement that is the same for all dots (a gel that slides in its case), by least squares, and taken off the ball's motion.
 
 - ``markers.dots``, ``.lost``, ``.size_um``: dots compared and lost, root mean square of their motion; ``.ball_um``, ``.turn_deg``.
 - ``markers.MODEL.rms_um``, ``….share``: root mean square distance of model and photographs, and over ``size_um``; ``….outside_um`` of the
@@ -28,7 +28,7 @@ import tyro
 from scipy import ndimage
 
 from experiments.running import recorded, run
-from raytac.calibrate.pressed_balls import pressed_balls
+from raytac.calibrate.pressed_balls import PressedBall, pressed_balls
 from raytac.checks import check_number
 from raytac.device import resolve_device
 from raytac.errors import InputError, RaytacError
@@ -48,7 +48,7 @@ from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 
 PITCH = 0.1e-3
 """Spacing of the pad's nodes [m]."""
-REACH, DARK, LEAST = 9.0, (0.3, 0.6), 15.0
+REACH, DARK, LEAST = 9.0, (0.1, 0.9), 15.0
 """Window of a dot's centroid [px]; darkness that counts not at all and wholly; least dark area of a dot [px]."""
 STEPS = 4
 """States of each of press and drag."""
@@ -93,10 +93,15 @@ class Drag:
     @classmethod
     def read(cls, folder: Path) -> Drag:
         """Dots that both photographs show; raises ``InputError`` for missing, damaged or unlike files."""
-        images = [read_png(folder / f"{k}.png") for k in (0, 1)]
+        try:
+            images = [read_png(folder / f"{k}.png") for k in (0, 1)]
+        except OSError as error:
+            raise InputError("data", value=str(folder), rule=f"must hold the photographs 0.png and 1.png: {error}") from error
         near = [_places(folder / f"{k}.csv") for k in (0, 1)]
         if images[0].shape != images[1].shape or near[0].shape != near[1].shape:
-            raise InputError("data", value=str(folder), rule="must hold two photographs of one size, with a row for each dot in both")
+            raise InputError(
+                "data", value=str(folder), rule="must hold two photographs of one size, with a row for each dot in both"
+            )
         (before, area), (after, later) = (dot_centres(image, places) for image, places in zip(images, near, strict=True))
         seen = (area >= LEAST) & (later >= LEAST)
         if seen.sum() < 3:
@@ -109,7 +114,9 @@ def _places(path: Path) -> np.ndarray:
     """About where the dots are [px], (N, 2)."""
     try:
         rows = list(csv.DictReader(path.read_text("utf-8").splitlines()))
-        start, motion = (np.array([[float(row[name]) for name in names] for row in rows]) for names in (("Mx", "My"), ("dx", "dy")))
+        start, motion = (
+            np.array([[float(row[name]) for name in names] for row in rows]) for names in (("Mx", "My"), ("dx", "dy"))
+        )
     except (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
         raise InputError("data", value=str(path), rule=f"must hold the columns Mx, My, dx, dy of numbers: {error}") from error
     return (start + motion).reshape(-1, 2)
@@ -118,8 +125,8 @@ def _places(path: Path) -> np.ndarray:
 def dot_centres(image: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centroids of dark dots [px], (N, 2), and their dark areas [px], (N,).
 
-    ``image`` (H, W, 3), ``near`` (N, 2): about where dots are [px]. Darkness is 1 less the brightest channel over what surrounds the dot; the
-    window of the centroid follows it until it stands still.
+    ``image`` (H, W, 3), ``near`` (N, 2): about where dots are [px]. Darkness is 1 less the brightest channel over what surrounds
+    the dot. The window of the centroid follows it until it stands still.
     """
     bright = image[..., :3].max(axis=2).astype(float)
     behind = ndimage.gaussian_filter(ndimage.percentile_filter(bright, 80, size=int(3 * REACH)), 6.0)
@@ -152,10 +159,10 @@ def rigid_motion(places: np.ndarray, motion: np.ndarray, centre: np.ndarray) -> 
 class Dragged:
     """A ball pressed and dragged on a pad of ``sensor``, and where the dots of the photographs go in every model."""
 
-    def __init__(self, sensor: SensorSpec, circle: np.ndarray, radius: float, depth: float, level: str, device: str) -> None:
-        """``circle`` [m]: x, y, radius of the contact in the pad frame; ``radius``, ``depth`` of the ball [m]."""
+    def __init__(self, sensor: SensorSpec, place: np.ndarray, radius: float, depth: float, level: str, device: str) -> None:
+        """``place`` (2,) [m], ``radius`` and ``depth`` of the ball [m]; ``level`` of the soft pad."""
         self.sensor, self.level, self.device, self.camera = sensor, level, device, camera_of(sensor)
-        self.depth, ball = depth, ObjectSpec("sphere", {"radius": radius}, (*circle[:2], 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)
+        self.depth, ball = depth, ObjectSpec("sphere", {"radius": radius}, (*map(float, place), 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)
         self.scene = PressScene("ball", ball, (StageSpec("indent", depth=depth),))
         self._kept: dict[tuple[float, ...], tuple[PadGrid, list[PadReading]]] = {}
 
@@ -235,21 +242,25 @@ def main(args: Args) -> None:
     quiet_solver()
     sensor = photographed(load_sensor(args.sensor), drag.size, args.pitch_mm / 1e3)
     radius, pitch_um = args.ball_radius_mm / 1e3, 1e3 * args.pitch_mm
-    (ball,) = pressed_balls(sensor, circle[None], np.array([radius]), Rigid(), pitch=PITCH, device=device)
-    if ball.surface is None:
-        raise InputError("circle_px", value=args.circle_px, rule="must be a contact that the ball can have")
-    place = ball.surface.contact_centre[0]
+    ball = pressed_ball(sensor, circle, radius, device)
+    assert ball.surface is not None
     under = np.hypot(*(drag.before - circle[:2]).T) < UNDER * circle[2]
     if under.sum() < 2:
         raise InputError("circle_px", value=args.circle_px, rule="must have at least two dots inside")
     own = rigid_motion(drag.before[under], drag.motion[under], circle[:2])
-    dragged = Dragged(sensor, np.append(place, circle[2] * args.pitch_mm / 1e3), radius, ball.depth, args.level, device)
+    dragged = Dragged(sensor, ball.surface.contact_centre[0], radius, ball.depth, args.level, device)
     with recorded(args, "real_markers", device=device) as (_, metrics):
         size = _rms(drag.motion) * pitch_um
         metrics |= {"markers.dots": len(drag.before), "markers.lost": drag.lost, "markers.size_um": size}
         metrics |= {"markers.ball_um": float(np.hypot(*own[0])) * pitch_um, "markers.turn_deg": float(np.degrees(own[1]))}
-        metrics |= {"markers.depth_mm": 1e3 * ball.depth, "markers.dots_under_ball": int(under.sum()), "markers.level": args.level}
-        print("| model | RMS [µm] | beside the ball | share | with a constant: RMS [µm] | beside the ball | share | constant [µm] |")
+        metrics |= {
+            "markers.depth_mm": 1e3 * ball.depth,
+            "markers.dots_under_ball": int(under.sum()),
+            "markers.level": args.level,
+        }
+        print(
+            "| model | RMS [µm] | beside the ball | share | with a constant: RMS [µm] | beside the ball | share | constant [µm] |"
+        )
         print("|" + "---|" * 8, flush=True)
         for name in models:
             cells = []
@@ -261,6 +272,14 @@ def main(args: Args) -> None:
             metrics |= {f"{key}.{axis}_um": float(c) * pitch_um for axis, c in zip("xy", constant, strict=True)}
             cells.append(", ".join(f"{c * pitch_um:.0f}" for c in constant))
             print(f"| {name} | {' | '.join(cells)} |", flush=True)
+
+
+def pressed_ball(sensor: SensorSpec, circle: np.ndarray, radius: float, device: str) -> PressedBall:
+    """The rigid pad under a ball whose imprint has a ``circle`` (3,) [px]; raises ``InputError`` for one that no depth gives."""
+    (ball,) = pressed_balls(sensor, circle[None], np.array([radius]), Rigid(), pitch=PITCH, device=device)
+    if ball.surface is None:
+        raise InputError("circle_px", value=circle.tolist(), rule="must be a contact that the ball can have")
+    return ball
 
 
 def photographed(sensor: SensorSpec, size: tuple[int, int], pitch: float) -> SensorSpec:
