@@ -11,8 +11,9 @@ imprint is as wide; and the ball's own motion, a displacement and a turn, by the
 constant: a displacement that is the same for all dots (a gel that slides in its case), by least squares, and taken off the ball's motion.
 
 - ``markers.dots``, ``.lost``, ``.size_um``: dots compared and lost, root mean square of their motion; ``.ball_um``, ``.turn_deg``.
-- ``markers.MODEL.rms_um``, ``….share``: root mean square distance of model and photographs, and over ``size_um``; ``….outside_um`` of the
-  dots that are not under the ball. ``markers.MODEL.constant.…``: the same with a constant, ``….x_um`` and ``….y_um`` its value.
+- ``markers.MODEL.rms_um``, ``….share``: root mean square distance of model and photographs, and over ``size_um``; ``….along_um`` of its
+  component along the ball's motion alone, ``….outside_um`` of the dots that are not under the ball.
+- ``markers.MODEL.constant.…``: the same with a constant, ``….x_um`` and ``….y_um`` its value.
 """
 
 from __future__ import annotations
@@ -258,18 +259,20 @@ def main(args: Args) -> None:
             "markers.dots_under_ball": int(under.sum()),
             "markers.level": args.level,
         }
+        axis = own[0] / np.hypot(*own[0])
         print(
-            "| model | RMS [µm] | beside the ball | share | with a constant: RMS [µm] | beside the ball | share | constant [µm] |"
+            "| model | RMS [µm] | along the drag | share | with a constant: RMS [µm] | along the drag | share | constant [µm] |"
         )
         print("|" + "---|" * 8, flush=True)
         for name in models:
             cells = []
             for key, with_constant in ((f"markers.{name}", False), (f"markers.{name}.constant", True)):
                 difference, constant = compared(drag, dragged, markers_config(name), own, with_constant)
-                rms, outside = _rms(difference) * pitch_um, _rms(difference[~under]) * pitch_um
-                metrics |= {f"{key}.rms_um": rms, f"{key}.outside_um": outside, f"{key}.share": rms / size}
-                cells += [f"{rms:.1f}", f"{outside:.1f}", f"{rms / size:.3f}"]
-            metrics |= {f"{key}.{axis}_um": float(c) * pitch_um for axis, c in zip("xy", constant, strict=True)}
+                rms, along = _rms(difference) * pitch_um, _rms((difference @ axis)[:, None]) * pitch_um
+                metrics |= {f"{key}.rms_um": rms, f"{key}.along_um": along, f"{key}.share": rms / size}
+                metrics[f"{key}.outside_um"] = _rms(difference[~under]) * pitch_um
+                cells += [f"{rms:.1f}", f"{along:.1f}", f"{rms / size:.3f}"]
+            metrics |= {f"{key}.{name_of}_um": float(c) * pitch_um for name_of, c in zip("xy", constant, strict=True)}
             cells.append(", ".join(f"{c * pitch_um:.0f}" for c in constant))
             print(f"| {name} | {' | '.join(cells)} |", flush=True)
 
