@@ -25,11 +25,12 @@ import numpy as np
 import tyro
 
 from experiments.running import recorded, run
+from raytac import quiet_warp
 from raytac.checks import check_number
 from raytac.device import resolve_device
 from raytac.errors import InputError, RaytacError
 from raytac.io import CommonOptions, parse_names
-from raytac.physics import RigidPad, SoftPad, quiet_solver
+from raytac.physics import RigidPad, SoftPad
 from raytac.physics.press import PressPad
 from raytac.specs import PADS, load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
@@ -120,7 +121,7 @@ def main(args: Args) -> None:
             changed = replace(sensor, gelpad=replace(sensor.gelpad, **{field: value}))
             variants.append((f".{field.removesuffix('_ratio')}_{value:g}", changed))
     device = resolve_device(args.device, ray_tracing=False)
-    quiet_solver()
+    quiet_warp()
     ball = ObjectSpec("sphere", {"radius": args.radius_mm / 1e3}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)
     scene = PressScene("ball", ball, (StageSpec("indent", depth=float(measured.depth[-1])),))
     with recorded(args, "real_force", device=device) as (_, metrics):

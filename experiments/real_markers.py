@@ -29,6 +29,7 @@ import tyro
 from scipy import ndimage
 
 from experiments.running import recorded, run
+from raytac import quiet_warp
 from raytac.calibrate.pressed_balls import PressedBall, pressed_balls
 from raytac.checks import check_number
 from raytac.device import resolve_device
@@ -42,7 +43,7 @@ from raytac.markers.contacts import ContactCells
 from raytac.markers.pattern import camera_of
 from raytac.markers.registry import MARKERS, markers_config
 from raytac.markers.sampling import height_at
-from raytac.physics import Rigid, RigidPad, SoftPad, quiet_solver
+from raytac.physics import Rigid, RigidPad, SoftPad
 from raytac.physics.base import PadReading
 from raytac.specs import PADS, SensorSpec, load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
@@ -163,7 +164,10 @@ class Dragged:
     def __init__(self, sensor: SensorSpec, place: np.ndarray, radius: float, depth: float, level: str, device: str) -> None:
         """``place`` (2,) [m], ``radius`` and ``depth`` of the ball [m]; ``level`` of the soft pad."""
         self.sensor, self.level, self.device, self.camera = sensor, level, device, camera_of(sensor)
-        self.depth, ball = depth, ObjectSpec("sphere", {"radius": radius}, (*map(float, place), 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)
+        self.depth, ball = (
+            depth,
+            ObjectSpec("sphere", {"radius": radius}, (float(place[0]), float(place[1]), 0.0), (1.0, 0.0, 0.0, 0.0), 0.1),
+        )
         self.scene = PressScene("ball", ball, (StageSpec("indent", depth=depth),))
         self._kept: dict[tuple[float, ...], tuple[PadGrid, list[PadReading]]] = {}
 
@@ -240,7 +244,7 @@ def main(args: Args) -> None:
     circle = _circle(args.circle_px)
     drag = Drag.read(args.data)
     device = resolve_device(args.device, ray_tracing=False)
-    quiet_solver()
+    quiet_warp()
     sensor = photographed(load_sensor(args.sensor), drag.size, args.pitch_mm / 1e3)
     radius, pitch_um = args.ball_radius_mm / 1e3, 1e3 * args.pitch_mm
     ball = pressed_ball(sensor, circle, radius, device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -117,10 +118,16 @@ def test_a_model_recovers_its_own_drag_with_its_constant(tmp_path: Path, dots: n
     """Dots that FOTS moves on a gel that slides as a whole: FOTS with a constant leaves the centroids' noise, others more."""
     sensor = real_markers.photographed(load_sensor("gelsight_mini"), SIZE, PITCH / 1e3)
     ball = real_markers.pressed_ball(sensor, CIRCLE, BALL, "cpu")
+    assert ball.surface is not None
     dragged = real_markers.Dragged(sensor, ball.surface.contact_centre[0], BALL, ball.depth, "coarse", "cpu")
     motion = dragged.motion(markers_config("fots"), dots, DRAG * PITCH / 1e3, TURN) + CONSTANT
     data = drag_folder(tmp_path, dots, dots + motion)
-    args = {"circle_px": ",".join(map(str, CIRCLE)), "ball_radius_mm": 1e3 * BALL, "pitch_mm": PITCH, "device": "cpu"}
+    args: dict[str, Any] = {
+        "circle_px": ",".join(map(str, CIRCLE)),
+        "ball_radius_mm": 1e3 * BALL,
+        "pitch_mm": PITCH,
+        "device": "cpu",
+    }
     real_markers.main(real_markers.Args(data=data, models="fots,force_field", out=tmp_path / "run", **args))
     metrics = read_metrics(tmp_path / "run" / "metrics.json")
     assert (metrics["markers.dots"], metrics["markers.lost"]) == (len(dots), 0)
@@ -137,7 +144,9 @@ def test_drags_without_their_files_are_refused(tmp_path: Path, dots: np.ndarray)
         real_markers.Drag.read(tmp_path)
     data = drag_folder(tmp_path, dots, dots)
     for name, text in (("circle_px", "1,2"), ("circle_px", "20,20,3"), ("models", "none"), ("level", "huge")):
-        args = {"circle_px": "150,118,36", "ball_radius_mm": 3.0, "pitch_mm": PITCH, "device": "cpu"} | {name: text}
+        args: dict[str, Any] = {"circle_px": "150,118,36", "ball_radius_mm": 3.0, "pitch_mm": PITCH, "device": "cpu"} | {
+            name: text
+        }
         with pytest.raises(InputError, match=name):
             real_markers.main(real_markers.Args(data=data, out=tmp_path / "run", **args))
     (data / "1.csv").write_text("Mx,My\n1,2\n", "utf-8")
