@@ -61,7 +61,7 @@ def contact_radius(surface: GelSurface) -> float:
 
 
 def edge_radius(surface: GelSurface, at: tuple[float, float], widest: float) -> float:
-    """Radius [m], up to ``widest``, of the circle about ``at`` [m] across which normals change most.
+    """Radius [m], up to ``widest``, of the circle about ``at`` [m] where normals change most.
 
     As circles are found in images: the mean over angles of the step of the normal from ``EDGE`` inside to ``EDGE`` outside is greatest. Of
     the first environment, less the pad's dome. 0 without a step.
