@@ -41,7 +41,8 @@ class CompareRealArgs(FitOptions):
     imprint: str = "fitted"
     """Imprints to compare, joined by commas: fitted, rigid, ipc (docs/real-images.md).
 
-    Under rigid and ipc the pad's physics gives the gel's surface, at the depth where the contact is as wide as the label's circle."""
+    Under rigid and ipc the pad's physics gives the gel's surface, at the depth where the edge of the imprint is as wide as the label's
+    circle, and lights are fitted under the rigid pad's profile of slopes."""
     imprint_level: Annotated[str, named(PADS)] = "medium"
     """Mesh of the soft pad of `--imprint ipc`."""
 

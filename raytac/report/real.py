@@ -63,6 +63,8 @@ def _one_a_colour(sensor: SensorSpec) -> SensorSpec:
     return replace(sensor, lights=replace(sensor.lights, leds=tuple(first)))
 
 
+HELD = Ablation(fixed=("slope",))
+"""Lights fitted under the rigid pad's profile of slopes, which stays."""
 ABLATIONS: dict[str, Ablation] = {
     # The case's glow is rendered with the bounce, so it goes too: to be held against no_glow.
     "no_inter_reflection": Ablation(sensor=lambda s: _leds(s, glow=0.0), fixed=("glow",), bounce=False),
@@ -75,7 +77,7 @@ ABLATIONS: dict[str, Ablation] = {
         sensor=lambda s: replace(s, response=replace(s.response, gamma=1.0, black_level=(0.0, 0.0, 0.0))), fixed=("stray",)
     ),
     "one_led_a_colour": Ablation(sensor=_one_a_colour),
-    "rigid_pad_imprint": Ablation(fixed=("slope",)),
+    "rigid_pad_imprint": HELD,
     "one_photograph_at_rest": Ablation(settle=False),
     "no_session_drift": Ablation(drift=False),
     "untied_leds": Ablation(prior="free"),
@@ -166,8 +168,11 @@ def compare_real(
                     if part is test:
                         seen = both[0]
                 if kind == "press":
+                    lit = models
+                    if set(settings.imprints) != {FITTED}:
+                        lit = _fitted(sensor, shots.take(train), settings, bar, modes=("raytrace",), one=HELD)
                     own = {"level": settings.level, "device": settings.device}
-                    for key, of in imprint_scores(models, sensor, shots.take(test), settings.imprints, **own).items():
+                    for key, of in imprint_scores(models, lit, sensor, shots.take(test), settings.imprints, **own).items():
                         imprints.setdefault(key, []).extend(of)
                     images |= {int(k): {mode: stack[i] for mode, stack in seen.items()} for i, k in enumerate(test)}
                 if number == 0:

@@ -33,22 +33,27 @@ def check_imprints(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def imprint_scores(
-    models: Models, sensor: SensorSpec, shots: Photographs, names: Sequence[str], *, level: str, device: str
+    models: Models, held: Models, sensor: SensorSpec, shots: Photographs, names: Sequence[str], *, level: str, device: str
 ) -> Scores:
     """Errors of the fitted ray tracer by imprint, of presses that were not fitted.
 
-    A circle has its centre as refined by ``models`` and its radius as labelled. That is all that the imprint is told of a press.
+    A circle has its centre as refined by the lights and its radius as labelled. That is all that the imprint is told of a press.
+
+    Args:
+        models: lights fitted with a free profile of slopes, for ``FITTED``.
+        held: lights fitted under the rigid pad's profile, for the pads: lights fitted with a free one make up for what it takes over.
     """
-    refined, out = models.circles(shots), {}
-    circles = np.column_stack([refined[:, :2], shots.circles[:, 2]])
+    out: Scores = {}
     for name in names:
+        lit = models if name == FITTED else held
+        circles = np.column_stack([lit.circles(shots)[:, :2], shots.circles[:, 2]])
         if name == FITTED:
             drift = models.drift(shots)
             images = drift.applied(images_of(models.modes[_MODE], sensor, shots, circles, models.fitted.state.slopes))
             out[f"{name}.{_MODE}"] = press_scores(sensor, images, shots)
         else:
             physics: PhysicsConfig = Rigid() if name == "rigid" else Ipc(level=level)
-            _press(out, name, models, sensor, shots, circles, physics, device)
+            _press(out, name, held, sensor, shots, circles, physics, device)
     return out
 
 
@@ -97,7 +102,7 @@ def imprint_table(metrics: Mapping[str, Metric]) -> list[str]:
     rows = []
     for name, text in ((FITTED, "fitted to other presses"), ("rigid", "rigid pad"), ("ipc", "soft pad")):
         for at, which in (
-            (f"{name}.{_MODE}", "contact as wide as the circle"),
+            (f"{name}.{_MODE}", "edge as wide as the circle"),
             (f"{name}.{AT_OVERLAP}.{_MODE}", "overlap as wide"),
         ):
             errors = [
@@ -105,7 +110,7 @@ def imprint_table(metrics: Mapping[str, Metric]) -> list[str]:
             ]
             if errors[0] is None:
                 continue
-            kind = "depth" if which.startswith("contact") else "overlap_depth"
+            kind = "depth" if which.startswith("edge") else "overlap_depth"
             depth = metrics.get(f"imprint.{name}.{kind}_mm")
             own = [f"{error:.2f}" for error in errors]
             unreached = metrics.get(f"imprint.{name}.unreached") if kind == "depth" else None

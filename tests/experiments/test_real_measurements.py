@@ -1,0 +1,154 @@
+"""Tables against measurements: from made-up data whose truth is known they give back that truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from experiments import real_force, real_markers
+from raytac.errors import InputError
+from raytac.io.images import write_png
+from raytac.io.metrics import read_metrics
+from raytac.markers.registry import markers_config
+from raytac.physics import RigidPad
+from raytac.specs import ObjectSpec, PressScene, StageSpec, load_sensor
+
+SIZE, PITCH = (320, 240), 0.0532
+CIRCLE, BALL = np.array([150.0, 118.0, 36.0]), 3e-3
+DRAG, TURN, CONSTANT = np.array([-1.5, 8.0]), np.radians(1.0), np.array([0.6, 2.0])
+"""Displacement of the ball, of the whole gel [px], and turn of the ball."""
+
+
+def measured(folder: Path, force: np.ndarray, depths: tuple[float, ...]) -> Path:
+    path = folder / "force.csv"
+    rows = [f"{depth},{value}" for depth, value in zip(depths, force, strict=True)]
+    path.write_text("\n".join(["# made up", "depth_mm,force_n", *rows]) + "\n", "utf-8")
+    return path
+
+
+def test_a_modulus_is_recovered_from_forces_of_the_pad_itself(tmp_path: Path) -> None:
+    """Forces 1.25 times the pad's own are off by a fifth, and by nothing with the modulus fitted to other depths."""
+    depths = 0.3, 0.6, 1.0
+    ball = ObjectSpec("sphere", {"radius": 5e-3}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)
+    pad = RigidPad(load_sensor("gelsight_mini"), PressScene("ball", ball, (StageSpec("indent", depth=1e-3),)), pitch=1e-4)
+    own = real_force.pressed_forces(pad, 1e-3 * np.array(depths))
+    assert own[0] > 0.1 and (np.diff(own) > 0).all()
+    data = measured(tmp_path, 1.25 * own, depths)
+    args = real_force.Args(data=data, radius_mm=5.0, levels="", poisson_ratios="0.3", out=tmp_path / "run", device="cpu")
+    real_force.main(args)
+    metrics = read_metrics(tmp_path / "run" / "metrics.json")
+    assert metrics["force.rigid.modulus_kpa"] == pytest.approx(1.25 * 430.0, rel=1e-6)
+    for depth in depths:
+        assert metrics[f"force.rigid.{depth:g}.error"] == pytest.approx(-0.2, abs=1e-6)
+        assert metrics[f"force.rigid.{depth:g}.held_out_error"] == pytest.approx(0.0, abs=1e-6)
+    # Another Poisson's ratio changes how force grows with depth, which no modulus takes back.
+    assert float(metrics["force.rigid.poisson_0.3.held_out_worst"]) > 0.02
+
+
+def test_a_fitted_modulus_is_of_the_other_depths() -> None:
+    force, true = np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 6.0])
+    assert real_force.modulus_factor(force, force) == 1.0
+    np.testing.assert_allclose(real_force.held_out_errors(force, true)[2], -0.5)
+    factor = real_force.modulus_factor(force, true)
+    off = [np.square(f * force / true - 1.0).sum() for f in (factor - 1e-4, factor, factor + 1e-4)]
+    assert off[1] < min(off[0], off[2])
+
+
+def test_files_of_forces_that_say_nothing_are_refused(tmp_path: Path) -> None:
+    cases = {
+        "depth_mm\n1\n": "columns",
+        "depth_mm,force_n\n1,x\n2,3\n": "numbers",
+        "depth_mm,force_n\n1,2\n1,3\n": "each depth once",
+    }
+    for text, message in cases.items():
+        (tmp_path / "force.csv").write_text(text, "utf-8")
+        with pytest.raises(InputError, match=message):
+            real_force.Measured.read(tmp_path / "force.csv")
+    with pytest.raises(InputError, match="cannot be read"):
+        real_force.Measured.read(tmp_path / "none.csv")
+    with pytest.raises(InputError, match="poisson_ratios"):
+        data = measured(tmp_path, np.array([1.0, 2.0]), (1.0, 2.0))
+        real_force.main(real_force.Args(data=data, radius_mm=5.0, levels="", poisson_ratios="0.6", device="cpu"))
+
+
+def photograph(centres: np.ndarray, radius: float = 4.6) -> np.ndarray:
+    """Dark round dots on a bright ground that is uneven, with edges one pixel wide."""
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
+    ground = 180.0 + 0.15 * u - 0.1 * v
+    for x, y in centres:
+        ground = ground * (1.0 - 0.85 * np.clip(radius + 0.5 - np.hypot(u - x, v - y), 0.0, 1.0))
+    return np.repeat(np.rint(ground).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def drag_folder(folder: Path, before: np.ndarray, after: np.ndarray) -> Path:
+    for k, centres in enumerate((before, after)):
+        write_png(folder / f"{k}.png", photograph(centres))
+        start = np.rint(before)
+        rows = np.column_stack([start, np.rint(centres - start)]).astype(int)
+        lines = ["Mx,My,dx,dy", *(",".join(map(str, row)) for row in rows)]
+        (folder / f"{k}.csv").write_text("\n".join(lines) + "\n", "utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def dots() -> np.ndarray:
+    x, y = np.meshgrid(np.arange(25.0, 310.0, 26.0), np.arange(20.0, 230.0, 24.0))
+    return np.column_stack([x.ravel(), y.ravel()]) + np.random.default_rng(1).uniform(-0.5, 0.5, (x.size, 2))
+
+
+def test_centroids_of_dots_are_right_below_a_pixel(dots: np.ndarray) -> None:
+    centres, areas = real_markers.dot_centres(photograph(dots), np.rint(dots) + np.array([3.0, -2.0]))
+    assert np.abs(centres - dots).max() < 0.04 and areas.min() > 50.0
+    _, none = real_markers.dot_centres(photograph(dots[:1]), dots[:1] + 60.0)
+    assert none[0] < real_markers.LEAST
+
+
+def test_a_rigid_motion_is_recovered() -> None:
+    places = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 8.0]])
+    turned = 0.01 * np.column_stack([-(places[:, 1] - 2.0), places[:, 0] - 1.0])
+    moved, turn = real_markers.rigid_motion(places, turned + np.array([3.0, -1.0]), np.array([1.0, 2.0]))
+    np.testing.assert_allclose(moved, (3.0, -1.0), atol=1e-12)
+    assert turn == pytest.approx(0.01)
+
+
+def test_a_model_recovers_its_own_drag_with_its_constant(tmp_path: Path, dots: np.ndarray) -> None:
+    """Dots that FOTS moves on a gel that slides as a whole: FOTS with a constant leaves the centroids' noise, others more."""
+    sensor = real_markers.photographed(load_sensor("gelsight_mini"), SIZE, PITCH / 1e3)
+    ball = real_markers.pressed_ball(sensor, CIRCLE, BALL, "cpu")
+    assert ball.surface is not None
+    dragged = real_markers.Dragged(sensor, ball.surface.contact_centre[0], BALL, ball.depth, "coarse", "cpu")
+    motion = dragged.motion(markers_config("fots"), dots, DRAG * PITCH / 1e3, TURN) + CONSTANT
+    data = drag_folder(tmp_path, dots, dots + motion)
+    args: dict[str, Any] = {
+        "circle_px": ",".join(map(str, CIRCLE)),
+        "ball_radius_mm": 1e3 * BALL,
+        "pitch_mm": PITCH,
+        "device": "cpu",
+    }
+    real_markers.main(real_markers.Args(data=data, models="fots,force_field", out=tmp_path / "run", **args))
+    metrics = read_metrics(tmp_path / "run" / "metrics.json")
+    assert (metrics["markers.dots"], metrics["markers.lost"]) == (len(dots), 0)
+    assert metrics["markers.ball_um"] == pytest.approx(1e3 * PITCH * np.hypot(*(DRAG + CONSTANT)), rel=0.03)
+    assert metrics["markers.turn_deg"] == pytest.approx(1.0, abs=0.4)
+    fots = {key: float(metrics[f"markers.fots.{key}"]) for key in ("rms_um", "constant.rms_um", "constant.x_um", "constant.y_um")}
+    assert fots["constant.rms_um"] < 8.0 < 50.0 < fots["rms_um"]
+    np.testing.assert_allclose((fots["constant.x_um"], fots["constant.y_um"]), 1e3 * PITCH * CONSTANT, atol=6.0)
+    assert float(metrics["markers.force_field.constant.rms_um"]) > 4.0 * fots["constant.rms_um"]
+
+
+def test_drags_without_their_files_are_refused(tmp_path: Path, dots: np.ndarray) -> None:
+    with pytest.raises(InputError, match=r"0\.png and 1\.png"):
+        real_markers.Drag.read(tmp_path)
+    data = drag_folder(tmp_path, dots, dots)
+    for name, text in (("circle_px", "1,2"), ("circle_px", "20,20,3"), ("models", "none"), ("level", "huge")):
+        args: dict[str, Any] = {"circle_px": "150,118,36", "ball_radius_mm": 3.0, "pitch_mm": PITCH, "device": "cpu"} | {
+            name: text
+        }
+        with pytest.raises(InputError, match=name):
+            real_markers.main(real_markers.Args(data=data, out=tmp_path / "run", **args))
+    (data / "1.csv").write_text("Mx,My\n1,2\n", "utf-8")
+    with pytest.raises(InputError, match="Mx, My, dx, dy"):
+        real_markers.Drag.read(data)
