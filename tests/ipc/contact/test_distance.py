@@ -310,7 +310,9 @@ def test_surfaces_a_hair_apart_may_part() -> None:
 
 
 @pytest.mark.parametrize("edges", [True, False], ids=["edge-edge", "point-triangle"])
-def test_what_slides_and_turns_in_a_narrow_gap_is_stopped_only_where_the_gap_closes(rng: np.random.Generator, edges: bool) -> None:
+def test_what_slides_and_turns_in_a_narrow_gap_is_stopped_only_where_the_gap_closes(
+    rng: np.random.Generator, edges: bool
+) -> None:
     """Pairs 1e-10 to 1e-5 m apart slide by up to a tenth and turn about the contact: the path keeps a tenth of the gap, and is used up.
 
     Bounds that ask for the speed alone advance by a gap at a time, and give up on the way.
@@ -331,10 +333,16 @@ def test_what_slides_and_turns_in_a_narrow_gap_is_stopped_only_where_the_gap_clo
     out = wp.zeros((n, 2), dtype=wp.float64, device="cpu")
     arrays = [wp.array(a, dtype=wp.vec3d, device="cpu") for a in (x, d)]
     wp.launch(advance, dim=n, inputs=[*arrays, 0.1, 0.0], outputs=[out], device="cpu")
-    alpha, samples = out.numpy()[:, int(edges)], np.concatenate([np.linspace(0, 1, 1000), 1 - np.geomspace(1e-8, 1e-3, 1000)[::-1]])
+    alpha, samples = (
+        out.numpy()[:, int(edges)],
+        np.concatenate([np.linspace(0, 1, 1000), 1 - np.geomspace(1e-8, 1e-3, 1000)[::-1]]),
+    )
     paths = x[:, None] + (samples * alpha[:, None])[:, :, None, None] * d[:, None]
     pt, ee, t = coefficients(paths.reshape(-1, 4, 3))
-    weights, path = (ee if edges else pt).reshape(n, -1, 4), np.linalg.norm(t[:, int(edges)], axis=1).reshape(n, -1) / start[:, None]
+    weights, path = (
+        (ee if edges else pt).reshape(n, -1, 4),
+        np.linalg.norm(t[:, int(edges)], axis=1).reshape(n, -1) / start[:, None],
+    )
     rounding = 1e-15 * np.abs(x).max(axis=(1, 2)) / start
     assert (path.min(axis=1) > 0.1 - rounding).all()
     assert 0.2 < (alpha < 1).mean() < 0.98
