@@ -42,7 +42,10 @@ RESOLUTION = wp.constant(wp.float64(1.0e-13))
 
 @wp.func
 def time_to_gap(n: wp.vec3d, x: wp.vec3d, dx: wp.vec3d, gap: wp.float64) -> wp.float64:
-    """t up to which n·(x + t dx) is no less than the gap; 0 where it never is, infinite where it always is."""
+    """Time t up to which n·(x + t dx) is no less than the gap.
+
+    It is 0 where it is less at the start, infinite where it never is.
+    """
     height, rate = wp.dot(n, x), wp.dot(n, dx)
     if height < gap:
         return wp.float64(0.0)
@@ -65,7 +68,7 @@ def time_to_plane(
     d3: wp.vec3d,
     gap: wp.float64,
 ) -> wp.float64:
-    """t until which two primitives stay a ``gap`` apart along the unit vector n."""
+    """Time t until which two primitives stay a ``gap`` apart along the unit vector n."""
     t = wp.min(time_to_gap(n, x0 - x2, d0 - d2, gap), time_to_gap(n, x0 - x3, d0 - d3, gap))
     if ee:
         return wp.min(t, wp.min(time_to_gap(n, x1 - x2, d1 - d2, gap), time_to_gap(n, x1 - x3, d1 - d3, gap)))
@@ -74,7 +77,9 @@ def time_to_plane(
 
 @wp.func
 def first_root(g0: wp.float64, g1: wp.float64, g2: wp.float64, g3: wp.float64, t_max: wp.float64) -> wp.float64:
-    """A t in [0, t_max] up to which g0 + g1 t + g2 t² + g3 t³ is not negative, near the first root; 0 where g0 is not positive.
+    """Time t in [0, t_max] up to which g0 + g1 t + g2 t² + g3 t³ is not negative.
+
+    It is near the first root, and 0 where g0 is not positive.
 
     From each t to the root of a parabola below the cubic: that with its value and slope there, and its least second derivative.
     """
@@ -106,7 +111,9 @@ def time_to_meet(
     gap: wp.float64,
     t_max: wp.float64,
 ) -> wp.float64:
-    """t until which the lines along u0 + t u1 and v0 + t v1, w0 + t w1 apart, stay a ``gap`` from each other; at most t_max.
+    """Time t, at most t_max, until which two lines stay a ``gap`` from each other.
+
+    They run along u0 + t u1 and v0 + t v1, and w0 + t w1 joins them.
 
     A point and a plane likewise, with u and v in the plane. What rounding of u × v can make of the distance is taken off.
     """

@@ -18,7 +18,10 @@ wp.set_module_options({"enable_backward": False})
 BAD = 1e100
 """Sizes of steps above this are not finite numbers."""
 SLOW = wp.constant(wp.float64(0.505))
-"""Share of the last change of friction above which the next is an average: half of it, and some rounding."""
+"""Share of the last change of friction above which friction is averaged.
+
+Half of it, and some rounding.
+"""
 
 
 @wp.kernel
