@@ -335,6 +335,10 @@ class Collision:
         self._reduce(self._change_size, active, SUM, changed)
         self._launch(friction.share_of_change, self.batch, [self._force, active], [changed, sum_changed])
 
+    def undo_lag(self, active: wp.array) -> None:
+        """Put back the friction from before the last :meth:`lag`, in the mask (B,)."""
+        self._launch(friction.keep_lagged, self.lagged.limit.shape, [self._old, active], [self.lagged])
+
     def average(self, share: wp.array, active: wp.array) -> None:
         """Let a ``share`` (B,) of the limits be those of the last ``lag``.
 

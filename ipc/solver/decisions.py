@@ -17,6 +17,11 @@ wp.set_module_options({"enable_backward": False})
 
 BAD = 1e100
 """Sizes of steps above this are not finite numbers."""
+SLOW = wp.constant(wp.float64(0.505))
+"""Share of the last change of friction above which friction is averaged.
+
+Half of it, and some rounding.
+"""
 
 
 @wp.kernel
@@ -79,12 +84,16 @@ def after_lag(tolerance: wp.float64, max_relags: wp.int32, d: Decisions, f: Flag
     what Newton's tolerance leaves open.
 
     Where the change is not half the one before, the next forces are the mean of the new and the last: normal forces that friction has
-    changed, and friction that they bound, would else chase each other.
+    changed, and friction that they bound, would else chase each other. A mean alone halves a change; that is no reason for another.
+
+    An environment that ends here keeps the friction that Newton's method balanced: its forces are those that moved it.
     """
     env = wp.tid()
     d.averaging[env] = 0
+    d.settled[env] = d.lagging[env]
     if d.lagging[env] == 0:
         return
+    f.settled[0] = 1
     d.pending[env] = 0
     if d.relags[env] >= 0:
         if d.changed[env] <= tolerance or (2 * d.relags[env] >= max_relags and d.sum_changed[env] <= tolerance):
@@ -93,11 +102,12 @@ def after_lag(tolerance: wp.float64, max_relags: wp.int32, d: Decisions, f: Flag
         d.converged[env] = 0
         return
     d.share[env] = wp.float64(1.0)
-    if d.relags[env] > 0 and wp.float64(2.0) * d.changed[env] > d.last_changed[env]:
+    if d.relags[env] > 0 and d.changed[env] > SLOW * d.last_changed[env]:
         d.share[env] = wp.float64(0.5)
         d.averaging[env] = 1
         f.average[0] = 1
     d.last_changed[env] = d.changed[env]
+    d.settled[env] = 0
     d.relags[env] = d.relags[env] + 1
     d.active[env] = 1
     d.converged[env] = 0

@@ -191,6 +191,7 @@ class Newton:
             pot.collision.lag(d.relags, d.lagging, d.changed, d.sum_changed)
             state.launch(decisions.after_lag, self.settings.friction_tolerance, self.settings.friction_relags)
             wp.capture_if(state.flags.average, pot.collision.average, share=d.share, active=d.averaging)
+            wp.capture_if(state.flags.settled, pot.collision.undo_lag, active=d.settled)
 
     def _solve(self) -> None:
         """p for the active environments; with a definite matrix where negative curvature was met."""

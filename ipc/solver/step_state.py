@@ -63,6 +63,7 @@ class Decisions:
     sum_changed: FloatArray  # by how much the last lag changed the sum of the limits, as a share of it
     share: FloatArray  # of the last lag in the friction forces, the rest being those before it
     averaging: IntArray  # that share is not 1
+    settled: IntArray  # keeps the friction from before the last lag
     speed: FloatArray
     ccd: FloatArray
     min_gap: FloatArray
@@ -77,6 +78,7 @@ class Flags:
     go: IntArray
     pending: IntArray
     average: IntArray
+    settled: IntArray
     advance: IntArray
     again: IntArray
     tighten: IntArray

@@ -143,6 +143,21 @@ def test_a_step_whose_friction_does_not_settle_says_so() -> None:
     assert not all(settled)
 
 
+def test_forces_at_the_end_of_a_step_are_those_that_moved_the_bodies() -> None:
+    """However loosely friction was renewed: mass times the change of velocity is gravity and the contact forces, to Newton's tolerance."""
+    world, angle, size, missing = block_over_table(friction_tolerance=0.3, velocity_tolerance=1e-7), 0.0, 0.0, 0.0
+    before = world.rigid_motion("block")
+    for _ in range(6):
+        angle += 20.0 * world.settings.dt
+        world.set_target("table", rotation=(np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)))
+        assert world.step().converged[0]
+        now, forces = world.rigid_motion("block"), world.contact_forces("block")[0]
+        change = now.mass * ((now.velocity[0] - before.velocity[0]) / world.settings.dt + [0.0, 0.0, 9.81])
+        before, size = now, max(size, float(np.linalg.norm(forces, axis=1).sum()))
+        missing = max(missing, float(np.linalg.norm(change - forces.sum(axis=0))))
+    assert missing < 1e-4 * size, f"{missing / size:.3g} of the forces moved nothing"
+
+
 def sheared_pad(num_envs: int = 1, **settings: object) -> ipc.World:
     """A ball over a small pad."""
     ball = ipc.KinematicBody("ball", ipc.icosphere(BALL, 2), ipc.Pose((0.0, 0.0, BALL + TOUCH)))

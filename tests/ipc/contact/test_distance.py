@@ -307,3 +307,50 @@ def test_surfaces_a_hair_apart_may_part() -> None:
         arrays = [wp.array(a, dtype=wp.vec3d, device="cpu") for a in (x, d)]
         wp.launch(advance, dim=3, inputs=[*arrays, 0.1, 1e-13], outputs=[out], device="cpu")
         assert out.numpy()[:, 1] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("edges", [True, False], ids=["edge-edge", "point-triangle"])
+def test_what_slides_and_turns_in_a_narrow_gap_is_stopped_only_where_the_gap_closes(
+    rng: np.random.Generator, edges: bool
+) -> None:
+    """Pairs 1e-10 to 1e-5 m apart slide by up to a tenth and turn about the contact: the path keeps a tenth of the gap, and is used up.
+
+    Bounds that ask for the speed alone advance by a gap at a time, and give up on the way.
+    """
+    angle, gap = np.repeat([1e-7, 1e-5, 1e-2, 1.0], 100), 10 ** rng.uniform(-10, -5, 400)
+    x = crossing_edges(rng, angle, gap) if edges else points_over_slivers(rng, np.maximum(angle, 1e-3), gap)
+    c, normal = coefficients(x)[int(edges)], coefficients(x)[2][:, int(edges)]
+    met = (np.abs(c if edges else c[:, 1:]) > 0.05).all(axis=1)
+    x, c, normal = x[met], c[met], normal[met]
+    assert met.sum() > 100
+    n, start = len(x), np.linalg.norm(normal, axis=1)
+    normal = normal / start[:, None]
+    slide = 10 ** rng.uniform(-4, -1, (n, 1)) * np.cross(normal, rng.standard_normal((n, 3)))
+    turned = 0.02 * rng.standard_normal((n, 4))
+    turned -= (turned * c).sum(axis=1, keepdims=True) / (c * c).sum(axis=1, keepdims=True) * c  # the gap itself stays, at first
+    d = turned[:, :, None] * normal[:, None]
+    d[:, : 2 if edges else 1] += slide[:, None]
+    out = wp.zeros((n, 2), dtype=wp.float64, device="cpu")
+    arrays = [wp.array(a, dtype=wp.vec3d, device="cpu") for a in (x, d)]
+    wp.launch(advance, dim=n, inputs=[*arrays, 0.1, 0.0], outputs=[out], device="cpu")
+    alpha, samples = (
+        out.numpy()[:, int(edges)],
+        np.concatenate([np.linspace(0, 1, 1000), 1 - np.geomspace(1e-8, 1e-3, 1000)[::-1]]),
+    )
+    paths = x[:, None] + (samples * alpha[:, None])[:, :, None, None] * d[:, None]
+    pt, ee, t = coefficients(paths.reshape(-1, 4, 3))
+    weights, path = (
+        (ee if edges else pt).reshape(n, -1, 4),
+        np.linalg.norm(t[:, int(edges)], axis=1).reshape(n, -1) / start[:, None],
+    )
+    rounding = 1e-15 * np.abs(x).max(axis=(1, 2)) / start
+    assert (path.min(axis=1) > 0.1 - rounding).all()
+    assert 0.2 < (alpha < 1).mean() < 0.98
+    early = (alpha < 1) & (path[:, -1] > 0.2) & (alpha > 1e-5)  # an advance of less than 1e-6 is the last
+    assert not early.any(), f"stopped {path[early, -1]} of the gap apart at {alpha[early]}"
+    # The insides of both were closest all along, so no path leads around: they are on the sides where they were, by exact signs.
+    # Edges that turn through parallel ones change the sign without a touch.
+    inside = (np.abs(weights if edges else weights[..., 1:]) > 0.01).all(axis=(1, 2)) & (angle[met] > 1e-3)
+    ends = x + alpha[:, None, None] * d
+    sides = [orientation(*(a[inside, k] for k in range(4))) for a in (x, ends)]
+    assert inside.sum() > 50 and (sides[0] == sides[1]).all()
