@@ -148,9 +148,9 @@ def run(world_of: Iterator[tuple[ipc.World, str]], num_envs: int, device: str, l
     )
 
 
-def press_scene(size: int, envs: int, args: Args, cuda_graph: bool = True) -> Iterator[tuple[ipc.World, str]]:
+def press_scene(size: int, envs: int, args: Args, graph: bool = True) -> Iterator[tuple[ipc.World, str]]:
     """Down for ``PRESS`` steps, then at rest."""
-    settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=args.friction, cuda_graph=cuda_graph)
+    settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=args.friction, graph=graph)
     world = press_world(CELLS[size], settings, envs, args.device, CUT)
     share = 1 - args.spread * np.random.default_rng(args.seed).random(envs)
     for step in range(PRESS + HOLD):
@@ -160,9 +160,9 @@ def press_scene(size: int, envs: int, args: Args, cuda_graph: bool = True) -> It
         yield world, "press" if step < PRESS else "hold"
 
 
-def peg_scene(envs: int, args: Args, cuda_graph: bool = True) -> Iterator[tuple[ipc.World, str]]:
+def peg_scene(envs: int, args: Args, graph: bool = True) -> Iterator[tuple[ipc.World, str]]:
     """Close the grip, then lower the peg into the hole."""
-    world = peg_world(envs, args.device, cuda_graph)
+    world = peg_world(envs, args.device, graph)
     for phase in peg_drive(world):
         yield world, phase
 
@@ -217,7 +217,7 @@ def measure_press(size: int, envs: int, args: Args) -> dict[str, Metric]:
     key = f"{done.world.device.alias.split(':')[0]}.{size}" + (f"x{envs}" if envs > 1 else "")
     hold = done.seconds[np.isin(done.phases[1:], ("hold",))]
     stages = stages_apart(
-        done, lambda: run(press_scene(size, envs, args, cuda_graph=False), envs, args.device, args.limit_s), args
+        done, lambda: run(press_scene(size, envs, args, graph=False), envs, args.device, args.limit_s), args
     )
     metrics = common_metrics(key, done, ("press",), envs, stages) | {
         f"{key}.vertices": len(done.world.positions("pad")[0]),
@@ -237,7 +237,7 @@ def measure_peg(envs: int, args: Args) -> dict[str, Metric]:
     key = f"{world.device.alias.split(':')[0]}.peg{vertices // 2}" + (f"x{envs}" if envs > 1 else "")
     A, p = world.affine_pose("peg")
     slip = p[:, 2] - world.frame("left")[1][:, 2]
-    stages = stages_apart(done, lambda: run(peg_scene(envs, args, cuda_graph=False), envs, args.device, args.limit_s), args)
+    stages = stages_apart(done, lambda: run(peg_scene(envs, args, graph=False), envs, args.device, args.limit_s), args)
     metrics = common_metrics(key, done, ("close", "lower"), envs, stages) | {
         f"{key}.vertices": vertices,
         f"{key}.grip_n": float(world.wrench("right").force[:, 0].max()),
