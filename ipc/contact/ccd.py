@@ -18,7 +18,7 @@ import warp as wp
 
 from ipc.arrays import FloatArray, IntArray, MatArray2d, VecArray2d
 from ipc.broad_phase.lists import Candidates, Surface, pair_at, pair_vertices, pairs_of
-from ipc.contact.distance import pair_coefficients, separation
+from ipc.contact.distance import box_gap, pair_coefficients, separation
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,6 +31,19 @@ RESOLUTION = wp.constant(wp.float64(1.0e-13))
 @wp.func
 def pair_distance(ee: wp.bool, x0: wp.vec3d, x1: wp.vec3d, x2: wp.vec3d, x3: wp.vec3d) -> wp.float64:
     return wp.length(separation(pair_coefficients(ee, x0, x1, x2, x3), x0, x1, x2, x3))
+
+
+@wp.func
+def allowed_gap(start: wp.float64, slack: wp.float64, floor: wp.float64, least: wp.float64) -> wp.float64:
+    """Distance [m] at which the advance of a pair stops that begins at the distance ``start``; see :func:`additive_ccd`."""
+    most = wp.float64(0.999)
+    return wp.max(wp.max(slack * start, wp.min(floor, most * start)), most * wp.min(least, start))
+
+
+@wp.func
+def allowed_end(start: wp.float64, slack: wp.float64, floor: wp.float64, least: wp.float64) -> wp.float64:
+    """Least distance [m] at the end of the advance."""
+    return wp.max(allowed_gap(start, slack, floor, least), wp.min(least, start))
 
 
 @wp.func
@@ -62,10 +75,13 @@ def additive_ccd(
         speed = wp.max(s0, s1) + wp.max(s2, s3)
     if speed == zero:
         return t_max
+    # What remains of a distance grows with it, so that of the boxes may say that there is enough.
+    apart = box_gap(ee, x0, x1, x2, x3)
+    if apart > zero and apart - allowed_end(apart, slack, floor, least) > speed * t_max:
+        return t_max
     start = pair_distance(ee, x0, x1, x2, x3)
-    most = wp.float64(0.999)
-    gap = wp.max(wp.max(slack * start, wp.min(floor, most * start)), most * wp.min(least, start))
-    end = wp.max(gap, wp.min(least, start))
+    gap = allowed_gap(start, slack, floor, least)
+    end = allowed_end(start, slack, floor, least)
     if start - end > speed * t_max:
         return t_max
     t, safe, d = zero, zero, start
