@@ -17,7 +17,7 @@ from __future__ import annotations
 import warp as wp
 
 from ipc.arrays import FloatArray, IntArray, MatArray2d, VecArray2d
-from ipc.broad_phase.lists import Candidates, Surface, pair_at, pair_vertices, pairs_of
+from ipc.broad_phase.lists import Candidates, Surface, gap_bounds, pair_at, pair_vertices, pairs_of
 from ipc.contact.distance import box_gap, pair_coefficients, separation
 
 wp.set_module_options({"enable_backward": False})
@@ -120,6 +120,9 @@ def ccd_pairs(
     """Lowers alpha[env] to what the edge-edge (``ee``) or point-triangle pairs allow."""
     env, i = wp.tid()
     if active[env] == 0 or i >= pairs_of(candidates, ee, env):
+        return
+    near, most = gap_bounds(candidates, ee, env, i)
+    if near > wp.float64(2.0) * allowed_end(most, slack[env], floor[env], RESOLUTION * reach[env]):
         return
     v = pair_vertices(surface, ee, pair_at(candidates, ee, env, i))
     bound = alpha[env]

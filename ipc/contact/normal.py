@@ -17,7 +17,7 @@ from __future__ import annotations
 import warp as wp
 
 from ipc.arrays import FloatArray, IntArray, MatArray2d, VecArray2d
-from ipc.broad_phase.lists import Candidates, Surface, pair_at, pair_vertices, pairs_of
+from ipc.broad_phase.lists import Candidates, Surface, gap_bounds, pair_at, pair_vertices, pairs_of
 from ipc.contact.barrier import barrier, barrier_first, barrier_second, mollifier, mollifier_first, mollifier_second
 from ipc.contact.contacts import Contacts, push_contact, push_matrix, push_row
 from ipc.contact.distance import box_gap, pair_coefficients, separation
@@ -172,6 +172,9 @@ def contact_pairs(
     if active[env] == 0:
         return
     for i in range(lane, pairs_of(candidates, ee, env), lanes):
+        near, _most = gap_bounds(candidates, ee, env, i)
+        if near >= surface.d_hat:
+            continue
         item = pair_at(candidates, ee, env, i)
         verts = pair_vertices(surface, ee, item)
         x0, x1, x2, x3 = x[env, verts[0]], x[env, verts[1]], x[env, verts[2]], x[env, verts[3]]
@@ -257,6 +260,9 @@ def energy_pairs(
     if active[env] == 0:
         return
     for i in range(lane, pairs_of(candidates, ee, env), lanes):
+        near, _most = gap_bounds(candidates, ee, env, i)
+        if near >= surface.d_hat:
+            continue
         pair = pair_at(candidates, ee, env, i)
         e = pair_energy(x1, surface, env, ee, pair) - pair_energy(x0, surface, env, ee, pair)
         if e != wp.float64(0.0):
