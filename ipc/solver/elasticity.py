@@ -198,9 +198,9 @@ def strain_energy_change(
     if model == 1:
         a = one + wp.float64(0.75) * mu / lam
         z = ic / (wp.ddot(F0, F0) + one)
-        log1p = wp.log(one + z)
-        if wp.abs(z) < wp.float64(1.0e-3):
-            log1p = z * (one - z * (half - z * (one / wp.float64(3.0) - z * (wp.float64(0.25) - z * wp.float64(0.2)))))
+        log1p = z * (one - z * (half - z * (one / wp.float64(3.0) - z * (wp.float64(0.25) - z * wp.float64(0.2)))))
+        if not (wp.abs(z) < wp.float64(1.0e-3)):
+            log1p = wp.log(one + z)
         return half * mu * (ic - log1p) + half * own * J * (both - wp.float64(2.0) * a) + barrier
     return half * mu * ic - mu * J + half * own * J * (both - wp.float64(2.0)) + barrier
 
