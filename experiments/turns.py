@@ -96,6 +96,36 @@ def speedup(ours: Path, theirs: Path, scene: str, rounds: int = ROUNDS) -> dict[
     }
 
 
+def in_turn(against: Path, scenes: dict[str, str]) -> dict[str, str | int | float | bool]:
+    """Metrics of scenes by their keys; prints a line for each.
+
+    Raises ``InputError``: no checkout of this project.
+    """
+    from raytac.errors import InputError, RaytacError
+
+    ours, theirs = Path(__file__).resolve().parents[1], against.resolve()
+    if not (theirs / "ipc" / "world.py").is_file():
+        raise InputError("against", value=against, rule="must be a checkout of this project")
+    name = commit(theirs)
+    metrics: dict[str, str | int | float | bool] = {"against": name, "commit": commit(ours)}
+    for key, scene in scenes.items():
+        try:
+            values = speedup(ours, theirs, scene)
+        except ChildProcessError as error:
+            raise RaytacError(f"{scene}: {error}") from error
+        metrics |= {f"{key}.processor_ms_per_step": values["ms"], f"{key}.processor_ms_per_step_{name}": values["their_ms"]}
+        metrics |= {f"{key}.speedup_vs_{name}": values["speedup"]}
+        metrics |= {f"{key}.speedup_least": values["least"], f"{key}.speedup_most": values["most"]}
+        print(f"{key}: {values['ms']:.1f} ms against {values['their_ms']:.1f} of {name}, {values['speedup']:.2f} times", flush=True)
+    return metrics
+
+
+def commit(checkout: Path) -> str:
+    """Short name of a checkout's commit; the folder's name where git knows none."""
+    ended = subprocess.run(["git", "rev-parse", "--short=7", "HEAD"], cwd=checkout, capture_output=True, text=True, check=False)
+    return ended.stdout.strip() if ended.returncode == 0 else checkout.name
+
+
 def steps_of(scene: str) -> int:
     """Steps of a round."""
     return {"press": 20, "pad": 9}[scene.partition(":")[0]]

@@ -69,7 +69,10 @@ def pair_at(candidates: Candidates, ee: wp.bool, env: wp.int32, i: wp.int32) -> 
 
 @wp.func
 def gap_bounds(candidates: Candidates, ee: wp.bool, env: wp.int32, i: wp.int32):
-    """Least and largest distance [m] of candidate i in the motion that was checked last, with room for rounding."""
+    """Least and largest distance [m] of candidate i in the motion that was checked last.
+
+    With room for rounding.
+    """
     gap, moved = candidates.pt_gap[env, i] + wp.float64(0.0), wp.float64(2.0 + 1.0e-8) * candidates.moved[env]
     if ee:
         gap = candidates.ee_gap[env, i] + wp.float64(0.0)

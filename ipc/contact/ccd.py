@@ -35,7 +35,7 @@ def pair_distance(ee: wp.bool, x0: wp.vec3d, x1: wp.vec3d, x2: wp.vec3d, x3: wp.
 
 @wp.func
 def allowed_gap(start: wp.float64, slack: wp.float64, floor: wp.float64, least: wp.float64) -> wp.float64:
-    """Distance [m] at which the advance of a pair stops that begins at the distance ``start``; see :func:`additive_ccd`."""
+    """Distance [m] at which :func:`additive_ccd` stops for a pair at the distance ``start``."""
     most = wp.float64(0.999)
     return wp.max(wp.max(slack * start, wp.min(floor, most * start)), most * wp.min(least, start))
 

@@ -104,9 +104,9 @@ def separation(c: wp.vec4d, x0: wp.vec3d, x1: wp.vec3d, x2: wp.vec3d, x3: wp.vec
 
 @wp.func
 def box_gap(ee: wp.bool, x0: wp.vec3d, x1: wp.vec3d, x2: wp.vec3d, x3: wp.vec3d) -> wp.float64:
-    """Gap [m] between the boxes of two edges (``ee``) or of a point and a triangle, negative where they overlap on every axis.
+    """Gap [m] between the boxes of two edges (``ee``) or of a point and a triangle.
 
-    The pair is no closer than that, less a share of 1e-9 for rounding.
+    Negative where they overlap on every axis. The pair is no closer than that; it is less by a share of 1e-9 for rounding.
     """
     low, high, low2, high2 = x0, x0, wp.min(x2, x3), wp.max(x2, x3)
     if ee:

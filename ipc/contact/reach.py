@@ -27,7 +27,10 @@ DRIFT = 0.5
 
 @wp.kernel
 def find_drift(x: VecArray2d, dx: VecArray2d, reference: VecArray2d, active: IntArray, size: FloatArray2d, moved: FloatArray):
-    """Largest distance of a vertex from its reference on the way from x to x + dx [m]; clears ``moved``."""
+    """Largest distance of each vertex from its reference between x and x + dx [m].
+
+    Clears ``moved``.
+    """
     env, v = wp.tid()
     if active[env] == 0:
         return
@@ -39,7 +42,7 @@ def find_drift(x: VecArray2d, dx: VecArray2d, reference: VecArray2d, active: Int
 
 @wp.kernel
 def choose_far(moved: FloatArray, limit: wp.float64, stale: IntArray, active: IntArray, far: IntArray, any_far: IntArray):
-    """Marks environments with new lists, or in which a vertex has gone farther than ``limit`` [m]."""
+    """Marks environments with new lists, or with a vertex farther away than ``limit`` [m]."""
     env = wp.tid()
     far[env] = 0
     if active[env] != 0 and (stale[env] != 0 or not (moved[env] <= limit)):
@@ -93,7 +96,7 @@ class Reach:
     def update(
         self, x: wp.array, dx: wp.array, surface: Surface, candidates: Candidates, stale: wp.array, active: wp.array
     ) -> None:
-        """Let the ``gap`` and ``moved`` of the candidates hold for all positions from x to x + dx (B, V).
+        """Let the candidates' gaps and ``moved`` hold for positions from x to x + dx (B, V).
 
         Args:
             stale: mask (B,) of the environments with new lists.

@@ -352,7 +352,7 @@ def block_hessian(
 
 @wp.kernel
 def fill_inertia(upper: IntArray2d, masses: Masses, dt: FloatArray, active: IntArray, blocks: MatArray2d):
-    """Inertia and drag in the blocks on and above the diagonal; ``upper`` as in :func:`block_hessian`."""
+    """Inertia and drag in the blocks ``upper``, on and above the diagonal [N/m]."""
     env, u = wp.tid()
     if active[env] != 0:
         blocks[env, upper[u, 1]] = inertia_block(masses, dt, env, upper[u, 0])
@@ -385,7 +385,10 @@ def add_block(
     env: wp.int32,
     blocks: MatArray2d,
 ):
-    """Add the block of two corners to its place, or its transpose to the place −1 − ``place`` of that."""
+    """Add the block of two corners to ``place``.
+
+    A negative one is that of its transpose, less one and with the other sign.
+    """
     even, odd = even_part(model, mu, f, p.g, q.g, p.b, q.b, p.c, q.c), odd_part(model, f, F, p.g, q.g)
     if place >= 0:
         blocks[env, place] = blocks[env, place] + (even + odd)

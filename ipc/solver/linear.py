@@ -165,12 +165,12 @@ def add_row(system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32, 
 
 
 SPREAD = wp.constant(-2)
-"""First node of a row in which a vertex follows several nodes; :func:`add_row` takes it as it stands."""
+"""First node of a row that :func:`add_row` takes as it is: a vertex follows several nodes."""
 
 
 @wp.func
 def turn_row(system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32):
-    """Turn row r into its bodies' frames: ``node_row`` at the unknowns ``row_nodes``, −1 for none."""
+    """Turn row r into bodies' frames: ``node_row`` at unknowns ``row_nodes``, −1 for none."""
     verts, row = contacts.row_verts[env, r], contacts.row[env, r]
     turned, nodes = mat34d(), wp.vec4i(-1, -1, -1, -1)
     for k in range(4):
@@ -194,7 +194,7 @@ def turn_row(system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32)
 def add_turned_row(
     system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32, p: VecArray2d, out: VecArray2d
 ) -> wp.float64:
-    """What :func:`add_row` does, with what :func:`turn_row` prepared."""
+    """The same as :func:`add_row`, with what :func:`turn_row` prepared."""
     nodes = contacts.row_nodes[env, r]
     if nodes[0] == SPREAD:
         return add_row(system, contacts, env, r, p, out)
@@ -262,6 +262,9 @@ def push_blocks(system: SystemView, lift: VecArray2d, active: IntArray, residual
 
 class Preconditioner(Protocol):
     """Approximates H⁻¹, symmetric and positive definite."""
+
+    on_host: bool
+    """Some of its work is NumPy's, which no recording takes in."""
 
     def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
         """Take in the matrix of the active environments; ``rows`` is the largest row count."""

@@ -61,7 +61,7 @@ class Newton:
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:
         """Add a stage's time to ``timers``; a recorded step has no stages."""
-        if self.settings.graph:
+        if self._recorded():
             yield
             return
         start = time.perf_counter()
@@ -70,13 +70,16 @@ class Newton:
             wp.synchronize_device(self.device)
         self.timers[name] = self.timers.get(name, 0.0) + time.perf_counter() - start
 
+    def _recorded(self) -> bool:
+        return self.settings.graph and (self.device.is_cuda or not self.preconditioner.on_host)
+
     def _run(self, body: Callable[[], None]) -> None:
         """Run ``body`` from a recording, which is made at the first call and after buffers grow.
 
         On a CPU it is made at the second: a recording takes as long as two or three Newton iterations without it, and buffers often grow in
         the first steps of a world.
         """
-        if not self.settings.graph:
+        if not self._recorded():
             body()
             return
         key = body.__name__
