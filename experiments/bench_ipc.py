@@ -220,9 +220,7 @@ def measure_press(size: int, envs: int, args: Args) -> dict[str, Metric]:
     done = run(press_scene(size, envs, args), envs, args.device, args.limit_s)
     key = f"{done.world.device.alias.split(':')[0]}.{size}" + (f"x{envs}" if envs > 1 else "")
     hold = done.seconds[np.isin(done.phases[1:], ("hold",))]
-    stages = stages_apart(
-        done, lambda: run(press_scene(size, envs, args, graph=False), envs, args.device, args.limit_s), args
-    )
+    stages = stages_apart(done, lambda: run(press_scene(size, envs, args, graph=False), envs, args.device, args.limit_s), args)
     metrics = common_metrics(key, done, ("press",), envs, stages) | {
         f"{key}.vertices": len(done.world.positions("pad")[0]),
         f"{key}.force_n": float(done.world.wrench("ball").force[:, 2].max()),

@@ -116,7 +116,9 @@ def in_turn(against: Path, scenes: dict[str, str]) -> dict[str, str | int | floa
         metrics |= {f"{key}.processor_ms_per_step": values["ms"], f"{key}.processor_ms_per_step_{name}": values["their_ms"]}
         metrics |= {f"{key}.speedup_vs_{name}": values["speedup"]}
         metrics |= {f"{key}.speedup_least": values["least"], f"{key}.speedup_most": values["most"]}
-        print(f"{key}: {values['ms']:.1f} ms against {values['their_ms']:.1f} of {name}, {values['speedup']:.2f} times", flush=True)
+        print(
+            f"{key}: {values['ms']:.1f} ms against {values['their_ms']:.1f} of {name}, {values['speedup']:.2f} times", flush=True
+        )
     return metrics
 
 

@@ -397,9 +397,7 @@ def add_block(
 
 
 @wp.func
-def add_diagonal(
-    place: wp.int32, p: Corner, model: wp.int32, mu: wp.float64, f: wp.vec4d, env: wp.int32, blocks: MatArray2d
-):
+def add_diagonal(place: wp.int32, p: Corner, model: wp.int32, mu: wp.float64, f: wp.vec4d, env: wp.int32, blocks: MatArray2d):
     """The same of one corner."""
     blocks[env, place] = blocks[env, place] + even_part(model, mu, f, p.g, p.g, p.b, p.b, p.c, p.c)
 

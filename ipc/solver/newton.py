@@ -248,8 +248,9 @@ class Newton:
         state.launch(decisions.start_advance)
         wp.capture_while(state.flags.shorten, self._try_advance)
         state.launch(decisions.conclude_advance, self.settings.blocked_advance, self.settings.poor_advance)
-        for old, new in ((pot.y, pot.y1), (pot.x, pot.x1), (pot.R, pot.R1), (pot.t, pot.t1)):
-            pot.launch(dynamics.take, old.shape, [new, d.accepted], [old])
+        for old, new in ((pot.y, pot.y1), (pot.x, pot.x1), (pot.t, pot.t1)):
+            pot.launch(dynamics.take_vectors, old.shape, [new, d.accepted], [old])
+        pot.launch(dynamics.take_matrices, pot.R.shape, [pot.R1, d.accepted], [pot.R])
         pot.aim_inertia(pot.R, pot.t)
 
     def _try_advance(self) -> None:
@@ -285,8 +286,8 @@ class Newton:
             state.launch(decisions.start_search, pot.reach)
             wp.capture_while(state.flags.search, self._try_step)
             state.launch(decisions.end_search)
-            pot.launch(dynamics.take, pot.y.shape, [pot.y1, d.accepted], [pot.y])
-            pot.launch(dynamics.take, pot.x.shape, [pot.x1, d.accepted], [pot.x])
+            pot.launch(dynamics.take_vectors, pot.y.shape, [pot.y1, d.accepted], [pot.y])
+            pot.launch(dynamics.take_vectors, pot.x.shape, [pot.x1, d.accepted], [pot.x])
 
     def _try_step(self) -> None:
         pot, state = self.potential, self.state
@@ -310,7 +311,7 @@ class Newton:
         pot, state = self.potential, self.state
         d = state.decisions
         with self._stage("end"):
-            pot.launch(dynamics.take, pot.y.shape, [pot.y_start, d.accepted], [pot.y])
+            pot.launch(dynamics.take_vectors, pot.y.shape, [pot.y_start, d.accepted], [pot.y])
             pot.place_nodes(pot.xw1)
             pot.launch(dynamics.new_velocity, pot.xw.shape, [pot.xw1, pot.xw, pot.dt, d.good], [pot.v])
             pot.set_frames(d.progress, pot.R, pot.t)

@@ -89,7 +89,8 @@ def test_a_body_moved_by_hand_is_measured_anew() -> None:
         world.restore(state)
         if away:
             world.teleport("ball", (0.0, 0.0, 0.05))
-            assert not world.step().converged.size == 0 and not world.contacts().gap.size
+            world.step()
+            assert not world.contacts().gap.size
             world.restore(state)
         world.step()
         forces.append(world.wrench("ball").force.copy())

@@ -9,7 +9,7 @@ import ipc
 
 
 def pressed(graph: bool, room: int | None = None, envs: int = 2, steps: int = 7) -> tuple[ipc.World, list[ipc.StepReport]]:
-    """A ball that is pressed into a block and pushed aside, differently deep in each environment."""
+    """A ball pressed into a block, turned and pushed aside, differently deep in each environment."""
     x, z = np.linspace(-4e-3, 4e-3, 5), np.linspace(0.0, 3e-3, 3)
     mesh = ipc.box_mesh(x, x, z)
     base = np.flatnonzero(mesh.vertices[:, 2] < mesh.vertices[:, 2].min() + 1e-9)
@@ -24,7 +24,8 @@ def pressed(graph: bool, room: int | None = None, envs: int = 2, steps: int = 7)
     for k in range(steps):
         depth = 1e-4 * min(k + 1, 5) * (1.0 + 0.3 * np.arange(envs))
         place = np.stack([1e-5 * k * np.ones(envs), np.zeros(envs), top + 2.15e-3 - depth], axis=1)
-        world.set_target("ball", place)
+        half = 0.02 * min(k + 1, 5)
+        world.set_target("ball", place, rotation=(np.cos(half), np.sin(half), 0.0, 0.0))
         reports.append(world.step())
     return world, reports
 
