@@ -2,6 +2,7 @@
 
     python experiments/bench_ipc.py --sizes 300,1400,5300 --out runs/bench_ipc           # CPU or CUDA, whichever there is
     python experiments/bench_ipc.py --device cuda --sizes 300,1400,5300,18000 --envs 1,128,1024
+    python experiments/bench_ipc.py --sizes 300,1400 --against ../raytac_b682ef2         # steps in turn with another checkout's, on the CPU
     python experiments/bench_ipc.py --device cuda --pads peg --envs 256,4096 --out runs/bench_ipc_peg
 
 Press: a bonded pad of 20.75 × 25.25 × 4 mm (E = 0.1 MPa, ν = 0.45) and a sphere of 4 mm radius that is driven down 1 mm in 20 steps of
@@ -41,6 +42,7 @@ from bench_ipc_scenes import (
     peg_world,
     press_world,
 )
+from turns import in_turn
 
 import ipc
 from raytac.errors import InputError, RaytacError
@@ -67,7 +69,9 @@ class Args(CommonOptions):
     spread: float = 0.0
     """Share by which environments of the press differ in depth, drawn at random; 0: all do the same. In [0, 1)."""
     stages: bool = False
-    """On CUDA, go through each scene once more, kernel by kernel: a step that is one recorded graph does not tell its stages apart."""
+    """Go through each scene once more, kernel by kernel: a step that is one recorded graph does not tell its stages apart."""
+    against: Path | None = None
+    """Checkout of another commit: only steps of the press in turn with its own, one environment on the CPU (``turns.py``)."""
     limit_s: float = 120.0
     """A measurement stops after the step in which this time is up [s]; its steps so far count."""
 
@@ -148,9 +152,9 @@ def run(world_of: Iterator[tuple[ipc.World, str]], num_envs: int, device: str, l
     )
 
 
-def press_scene(size: int, envs: int, args: Args, cuda_graph: bool = True) -> Iterator[tuple[ipc.World, str]]:
+def press_scene(size: int, envs: int, args: Args, graph: bool = True) -> Iterator[tuple[ipc.World, str]]:
     """Down for ``PRESS`` steps, then at rest."""
-    settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=args.friction, cuda_graph=cuda_graph)
+    settings = ipc.Settings(dt=DT, d_hat=D_HAT, friction=args.friction, graph=graph)
     world = press_world(CELLS[size], settings, envs, args.device, CUT)
     share = 1 - args.spread * np.random.default_rng(args.seed).random(envs)
     for step in range(PRESS + HOLD):
@@ -160,16 +164,16 @@ def press_scene(size: int, envs: int, args: Args, cuda_graph: bool = True) -> It
         yield world, "press" if step < PRESS else "hold"
 
 
-def peg_scene(envs: int, args: Args, cuda_graph: bool = True) -> Iterator[tuple[ipc.World, str]]:
+def peg_scene(envs: int, args: Args, graph: bool = True) -> Iterator[tuple[ipc.World, str]]:
     """Close the grip, then lower the peg into the hole."""
-    world = peg_world(envs, args.device, cuda_graph)
+    world = peg_world(envs, args.device, graph)
     for phase in peg_drive(world):
         yield world, phase
 
 
 def stages_apart(done: Run, again: Callable[[], Run], args: Args) -> dict[str, float]:
-    """Seconds a step in each stage: of this run, or, where it was a recorded graph and ``--stages`` asks, of one without."""
-    return again().stages if done.world.device.is_cuda and args.stages else done.stages
+    """Seconds a step in each stage: where ``--stages`` asks, of a run without a recorded graph."""
+    return again().stages if args.stages else done.stages
 
 
 def common_metrics(key: str, run: Run, timed: tuple[str, ...], envs: int, stages: dict[str, float]) -> dict[str, Metric]:
@@ -216,9 +220,7 @@ def measure_press(size: int, envs: int, args: Args) -> dict[str, Metric]:
     done = run(press_scene(size, envs, args), envs, args.device, args.limit_s)
     key = f"{done.world.device.alias.split(':')[0]}.{size}" + (f"x{envs}" if envs > 1 else "")
     hold = done.seconds[np.isin(done.phases[1:], ("hold",))]
-    stages = stages_apart(
-        done, lambda: run(press_scene(size, envs, args, cuda_graph=False), envs, args.device, args.limit_s), args
-    )
+    stages = stages_apart(done, lambda: run(press_scene(size, envs, args, graph=False), envs, args.device, args.limit_s), args)
     metrics = common_metrics(key, done, ("press",), envs, stages) | {
         f"{key}.vertices": len(done.world.positions("pad")[0]),
         f"{key}.force_n": float(done.world.wrench("ball").force[:, 2].max()),
@@ -237,7 +239,7 @@ def measure_peg(envs: int, args: Args) -> dict[str, Metric]:
     key = f"{world.device.alias.split(':')[0]}.peg{vertices // 2}" + (f"x{envs}" if envs > 1 else "")
     A, p = world.affine_pose("peg")
     slip = p[:, 2] - world.frame("left")[1][:, 2]
-    stages = stages_apart(done, lambda: run(peg_scene(envs, args, cuda_graph=False), envs, args.device, args.limit_s), args)
+    stages = stages_apart(done, lambda: run(peg_scene(envs, args, graph=False), envs, args.device, args.limit_s), args)
     metrics = common_metrics(key, done, ("close", "lower"), envs, stages) | {
         f"{key}.vertices": vertices,
         f"{key}.grip_n": float(world.wrench("right").force[:, 0].max()),
@@ -266,6 +268,21 @@ def parse_numbers(text: str, option: str, choices: tuple[int, ...] | None = None
     return tuple(map(int, names))
 
 
+def alone(args: Args, sizes: tuple[int, ...], envs: tuple[int, ...]) -> dict[str, Metric]:
+    """All that this checkout is asked for."""
+    metrics: dict[str, Metric] = {"compile_s": compile_kernels(args.device)}
+    if args.pads == "peg":
+        print(f"peg: {PEG_CLOSE} steps to close, {PEG_LOWER} to lower")
+        for count in envs:
+            metrics |= measure_peg(count, args)
+        return metrics
+    for size in sizes:
+        for count in envs:
+            if count == 1 or size <= BATCHED:
+                metrics |= measure_press(size, count, args)
+    return metrics
+
+
 def main(args: Args) -> int:
     begin = time.perf_counter()
     sizes, envs = parse_numbers(args.sizes, "sizes", tuple(CELLS)), parse_numbers(args.envs, "envs")
@@ -273,16 +290,10 @@ def main(args: Args) -> int:
         raise InputError("spread", value=args.spread, rule="must lie in [0, 1)")
     if not args.limit_s > 0:
         raise InputError("limit-s", value=args.limit_s, rule="must be positive")
-    metrics: dict[str, Metric] = {"compile_s": compile_kernels(args.device)}
-    if args.pads == "peg":
-        print(f"peg: {PEG_CLOSE} steps to close, {PEG_LOWER} to lower")
-        for count in envs:
-            metrics |= measure_peg(count, args)
+    if args.against is not None:
+        metrics = in_turn(args.against, {f"cpu.{size}": f"press:{size}" for size in sizes})
     else:
-        for size in sizes:
-            for count in envs:
-                if count == 1 or size <= BATCHED:
-                    metrics |= measure_press(size, count, args)
+        metrics = alone(args, sizes, envs)
     common = {"experiment": "bench_ipc", "device": args.device, "seed": args.seed, **versions((*VERSIONED, "warp-lang"))}
     with result_folder(args.out or Path("runs/bench_ipc"), ("metrics.json",)) as folder:
         write_metrics(folder / "metrics.json", {**common, **metrics, "wall_s": time.perf_counter() - begin})

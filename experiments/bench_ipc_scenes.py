@@ -120,7 +120,7 @@ def _pad_poses() -> tuple[ipc.Pose, ipc.Pose]:
     return ipc.Pose((-half, 0.0, 0.0), (r, 0.0, r, 0.0)), ipc.Pose((half, 0.0, 0.0), (r, 0.0, -r, 0.0))
 
 
-def peg_world(num_envs: int, device: str, cuda_graph: bool = True) -> ipc.World:
+def peg_world(num_envs: int, device: str, graph: bool = True) -> ipc.World:
     """Two pads of 140 vertices, a free peg between them and, below it, a block with a hole that is off the peg's axis.
 
     As in the peg scene of Taccel (two pads of 139 vertices and an affine peg; h = 20 ms, d̂ = 0.1 mm, tolerance 1e-3 m/s; at most 20
@@ -134,7 +134,7 @@ def peg_world(num_envs: int, device: str, cuda_graph: bool = True) -> ipc.World:
         friction=FRICTION,
         velocity_tolerance=tolerance,
         friction_slip=tolerance * PEG_DT,
-        cuda_graph=cuda_graph,
+        graph=graph,
     )
     mesh = ipc.domed_pad(PEG_PAD, PEG_THICKNESS, (math.inf, math.inf), PEG_CELLS, cut="alike")
     base = ipc.vertices_in_box(mesh, (-1, -1, -PEG_THICKNESS), (1, 1, -PEG_THICKNESS))

@@ -165,7 +165,7 @@ def measure(size: int, envs: int, poisson: float, kind: str, args: Args) -> dict
     # The first step compiles, launch by launch; on CUDA the last ones do that again, for their stages.
     for k in range(PRESS + (STAGED if on.is_cuda else 0)):
         staged = k >= PRESS or not on.is_cuda
-        solver.settings = replace(settings, cuda_graph=not staged and k > 0)
+        solver.settings = replace(settings, graph=not staged and k > 0)
         if k == (PRESS if on.is_cuda else 1):
             solver.timers.clear()
         world.set_target("ball", (0, 0, RADIUS + GAP - TRAVEL * (k + 1) / PRESS))

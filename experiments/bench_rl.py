@@ -49,6 +49,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.running import recorded, run
+from experiments.turns import commit
 from raytac.checks import check_known, check_whole
 from raytac.device import resolve_device
 from raytac.envs import PushCubeVectorEnv, RollBallVectorEnv
@@ -247,12 +248,6 @@ def figure_of(checkout: Path, mode: str, args: Args) -> float:
             last = (ended.stderr.strip() or ended.stdout.strip() or "no message").splitlines()[-1]
             raise RaytacError(f"{mode} in {checkout} ended with {ended.returncode}: {last}")
         return float(read_metrics(Path(out, "run", "metrics.json"))[key])
-
-
-def commit(checkout: Path) -> str:
-    """Short name of a checkout's commit; the folder's name where git knows none."""
-    ended = subprocess.run(["git", "rev-parse", "--short=7", "HEAD"], cwd=checkout, capture_output=True, text=True, check=False)
-    return ended.stdout.strip() if ended.returncode == 0 else checkout.name
 
 
 def timed(tactile: ObservationSettings | None, args: Args) -> dict[str, Metric]:

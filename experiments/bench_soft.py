@@ -2,6 +2,7 @@
 
     python experiments/bench_soft.py --out runs/bench_soft                         # a few minutes on two cores
     python experiments/bench_soft.py --levels coarse,medium,fine --refined --out runs/bench_soft
+    python experiments/bench_soft.py --levels coarse --against ../raytac_b682ef2    # steps in turn with another checkout's, on the CPU
 
 A ball (3.155 mm, the scene "sphere") is pressed 0.8 mm into the GelSight Mini's pad in eight steps of 0.1 mm.
 
@@ -28,6 +29,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -35,6 +37,7 @@ import tyro
 
 import ipc
 from experiments.running import recorded, run
+from experiments.turns import in_turn
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io import CommonOptions, Metric, parse_names
@@ -87,6 +90,8 @@ class Args(CommonOptions):
     """Measure the force errors of the levels against the fine one, and nothing else."""
     study: bool = False
     """Measure the same for other gradings and volume blocks than the levels have."""
+    against: Path | None = None
+    """Checkout of another commit: only steps with image in turn with its own, on the CPU, GelSight Mini (``turns.py``)."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
 
@@ -96,6 +101,9 @@ class Args(CommonOptions):
             if level not in PADS:
                 raise InputError("levels", value=level, rule="must be a known level", choices=PADS)
         with recorded(self, "bench_soft", owned=("metrics.json",), packages=("warp-lang",)) as (_, metrics):
+            if self.against is not None:
+                metrics |= in_turn(self.against, {f"soft.{level}": f"pad:{level}" for level in levels})
+                return
             spec = load_sensor(self.sensor)
             device = resolve_device(self.device, ray_tracing=False)
             metrics |= force_errors(spec.gelpad, levels, device)

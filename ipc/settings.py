@@ -47,8 +47,8 @@ class Settings:
         blocked_advance: share of the motion of the driven bodies below which an advance after such a rest says that they are blocked [-].
         broad_phase: search for pairs that may touch: ``"lists"`` (all against all, of what reaches the other body), ``"bvh"``
             (bounding volume hierarchies), or ``"auto"`` (by the numbers of edges and of body pairs). The pairs are the same.
-        cuda_graph: on CUDA, run a step as one recorded graph. False launches kernel by kernel, which is slower but fills the stages of
-            ``World.timers``.
+        graph: run a step as one recorded graph; on a CPU from a world's second step on, and with the preconditioner ``"block_jacobi"``.
+            False launches kernel by kernel, with the same results; it is slower but fills the stages of ``World.timers``.
         deterministic: on CUDA, add contact forces and rows in a fixed order, one thread an environment: the same call gives the same
             bits, and an environment of a batch those of a world of its own. Slower; a CPU does it anyway. With ``"rest_inverse"`` asked
             for, a batch agrees with single worlds to the linear tolerance only.
@@ -77,7 +77,7 @@ class Settings:
     poor_advance: float = 0.05
     blocked_advance: float = 1e-4
     broad_phase: Literal["auto", "lists", "bvh"] = "auto"
-    cuda_graph: bool = True
+    graph: bool = True
     deterministic: bool = False
 
     def __post_init__(self) -> None:

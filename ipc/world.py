@@ -238,7 +238,7 @@ class World:
 
     @property
     def timers(self) -> dict[str, float]:
-        """Seconds spent in ``step`` and its stages (on CUDA without ``Settings.cuda_graph``)."""
+        """Seconds spent in ``step`` and its stages (these without ``Settings.graph``)."""
         return dict(self._newton.timers)
 
     def arrays(self, name: str) -> BodyArrays:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.arrays import FloatArray, IntArray, IntArray2d, VecArray2d
+from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, VecArray2d
 
 wp.set_module_options({"enable_backward": False})
 
@@ -37,12 +37,18 @@ class Surface:
 
 @wp.struct
 class Candidates:
-    """Pairs (first, second, body pair) that may come within d̂; counts may exceed what fits."""
+    """Pairs (first, second, body pair) that may come within d̂; counts may exceed what fits.
+
+    ``pt_gap``, ``ee_gap``: their distances [m] at positions from which no vertex is farther than ``moved`` [m] (:mod:`ipc.contact.reach`).
+    """
 
     pt: wp.array2d(dtype=wp.vec3i)
     ee: wp.array2d(dtype=wp.vec3i)
     pt_count: IntArray
     ee_count: IntArray
+    pt_gap: FloatArray2d
+    ee_gap: FloatArray2d
+    moved: FloatArray
 
 
 @wp.func
@@ -59,6 +65,18 @@ def pair_at(candidates: Candidates, ee: wp.bool, env: wp.int32, i: wp.int32) -> 
     if ee:
         return candidates.ee[env, i]
     return candidates.pt[env, i]
+
+
+@wp.func
+def gap_bounds(candidates: Candidates, ee: wp.bool, env: wp.int32, i: wp.int32):
+    """Least and largest distance [m] of candidate i in the motion that was checked last.
+
+    With room for rounding.
+    """
+    gap, moved = candidates.pt_gap[env, i] + wp.float64(0.0), wp.float64(2.0 + 1.0e-8) * candidates.moved[env]
+    if ee:
+        gap = candidates.ee_gap[env, i] + wp.float64(0.0)
+    return wp.float64(1.0 - 1.0e-9) * gap - moved, wp.float64(1.0 + 1.0e-9) * gap + moved
 
 
 @wp.func

@@ -26,8 +26,8 @@ from __future__ import annotations
 import warp as wp
 
 from ipc.arrays import FloatArray, IntArray, MatArray2d, VecArray2d
-from ipc.broad_phase.lists import Candidates, Surface, pair_at, pair_vertices, pairs_of
-from ipc.contact.distance import pair_coefficients, separation
+from ipc.broad_phase.lists import Candidates, Surface, gap_bounds, pair_at, pair_vertices, pairs_of
+from ipc.contact.distance import box_gap, pair_coefficients, separation
 
 wp.set_module_options({"enable_backward": False})
 
@@ -129,6 +129,19 @@ def time_to_meet(
 
 
 @wp.func
+def allowed_gap(start: wp.float64, slack: wp.float64, floor: wp.float64, least: wp.float64) -> wp.float64:
+    """Distance [m] at which :func:`additive_ccd` stops for a pair at the distance ``start``."""
+    most = wp.float64(0.999)
+    return wp.max(wp.max(slack * start, wp.min(floor, most * start)), most * wp.min(least, start))
+
+
+@wp.func
+def allowed_end(start: wp.float64, slack: wp.float64, floor: wp.float64, least: wp.float64) -> wp.float64:
+    """Least distance [m] at the end of the advance."""
+    return wp.max(allowed_gap(start, slack, floor, least), wp.min(least, start))
+
+
+@wp.func
 def additive_ccd(
     ee: wp.bool,
     x0: wp.vec3d,
@@ -157,14 +170,17 @@ def additive_ccd(
         speed = wp.max(s0, s1) + wp.max(s2, s3)
     if speed == zero:
         return t_max
+    # What remains of a distance grows with it, so that of the boxes may say that there is enough.
+    apart = box_gap(ee, x0, x1, x2, x3)
+    if apart > zero and apart - allowed_end(apart, slack, floor, least) > speed * t_max:
+        return t_max
     coef = pair_coefficients(ee, x0, x1, x2, x3)
     along = separation(coef, x0, x1, x2, x3)
     start = wp.length(along)
     if start == zero:
         return zero
-    most = wp.float64(0.999)
-    gap = wp.max(wp.max(slack * start, wp.min(floor, most * start)), most * wp.min(least, start))
-    end = wp.max(gap, wp.min(least, start))
+    gap = allowed_gap(start, slack, floor, least)
+    end = allowed_end(start, slack, floor, least)
     if start - end > speed * t_max:
         return t_max
     t, safe, d = zero, zero, start
@@ -216,6 +232,9 @@ def ccd_pairs(
     """Lowers alpha[env] to what the edge-edge (``ee``) or point-triangle pairs allow."""
     env, i = wp.tid()
     if active[env] == 0 or i >= pairs_of(candidates, ee, env):
+        return
+    near, most = gap_bounds(candidates, ee, env, i)
+    if near > wp.float64(2.0) * allowed_end(most, slack[env], floor[env], RESOLUTION * reach[env]):
         return
     v = pair_vertices(surface, ee, pair_at(candidates, ee, env, i))
     bound = alpha[env]

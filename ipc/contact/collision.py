@@ -16,6 +16,7 @@ from ipc.bodies.layout import Layout
 from ipc.broad_phase import lists
 from ipc.broad_phase.trees import Trees, trees_pay
 from ipc.contact import ccd, contacts, friction, normal
+from ipc.contact.reach import Reach
 from ipc.reduce import SUM, Reducer
 
 _GROW = 2
@@ -111,6 +112,8 @@ class Collision:
         self._stale = wp.zeros(batch, dtype=wp.int32, device=device)
         self.candidates = lists.Candidates()
         self.candidates.pt_count, self.candidates.ee_count = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
+        self.candidates.moved = wp.zeros(batch, dtype=wp.float64, device=device)
+        self._reach = Reach(batch, verts, d_hat, device)
         self._size_candidates(512, 1024)
         self.contacts = contacts.Contacts()
         self.contacts.count, self.contacts.row_count = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
@@ -142,12 +145,16 @@ class Collision:
 
     def _size_candidates(self, pt: int, ee: int) -> None:
         self.candidates.pt, self.candidates.ee = (wp.zeros((self.batch, n), dtype=wp.vec3i, device=self.device) for n in (pt, ee))
+        rooms = {"pt_gap": pt, "ee_gap": ee}
+        for name, room in rooms.items():
+            setattr(self.candidates, name, wp.zeros((self.batch, room), dtype=wp.float64, device=self.device))
         self._ordered = {n: wp.zeros((self.batch, n), dtype=wp.vec3i, device=self.device) for n in (pt, ee) if self._sort}
 
     def _size_contacts(self, pairs: int, rows: int) -> None:
         place = {"verts": wp.vec4i, "coef": wp.vec4d, "normal": wp.vec3d, "pair": wp.int32}
         self._resize(self.contacts, place | {"force": wp.float64, "gap": wp.float64}, pairs)
-        self._resize(self.contacts, {"row_verts": wp.vec4i, "row": contacts.mat34d}, rows)
+        fields = {"row_verts": wp.vec4i, "row": contacts.mat34d, "row_nodes": wp.vec4i, "node_row": contacts.mat34d}
+        self._resize(self.contacts, fields, rows)
         room = pairs if self.friction else 1
         for lagged in (self.lagged, self._old):  # contacts, and as many that have gone
             fields = place | {"limit": wp.float64, "slip": wp.vec3d, "turn": wp.mat33d, "swing": wp.vec3d}
@@ -196,6 +203,7 @@ class Collision:
         self._any_stale.zero_()
         self._launch(lists.leaves_box, x.shape, [x, dx, self._boxes, active], [self._stale, self._any_stale])
         wp.capture_if(self._any_stale, on_true=self._rebuild, x=x, dx=dx)
+        self._reach.update(x, dx, self.surface, self.candidates, self._stale, active)
 
     def _rebuild(self, x: wp.array, dx: wp.array) -> None:
         """New boxes and lists for the stale environments."""

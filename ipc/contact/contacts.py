@@ -17,7 +17,10 @@ class mat34d(wp.types.matrix(shape=(3, 4), dtype=wp.float64)):
 
 @wp.struct
 class Contacts:
-    """Pairs within d̂ and the rows of their Hessian; a vertex of −1 is unused."""
+    """Pairs within d̂ and the rows of their Hessian; a vertex of −1 is unused.
+
+    ``node_row``, ``row_nodes``: work space for the same rows over unknowns.
+    """
 
     verts: wp.array2d(dtype=wp.vec4i)
     coef: wp.array2d(dtype=wp.vec4d)
@@ -29,6 +32,8 @@ class Contacts:
     row_verts: wp.array2d(dtype=wp.vec4i)
     row: wp.array2d(dtype=mat34d)
     row_count: IntArray
+    row_nodes: wp.array2d(dtype=wp.vec4i)
+    node_row: wp.array2d(dtype=mat34d)
 
 
 @wp.func

@@ -100,3 +100,18 @@ def pair_coefficients(ee: wp.bool, x0: wp.vec3d, x1: wp.vec3d, x2: wp.vec3d, x3:
 def separation(c: wp.vec4d, x0: wp.vec3d, x1: wp.vec3d, x2: wp.vec3d, x3: wp.vec3d) -> wp.vec3d:
     """t = Σ c_i x_i [m], from differences to x0, which keep digits far from the origin."""
     return c[1] * (x1 - x0) + c[2] * (x2 - x0) + c[3] * (x3 - x0)
+
+
+@wp.func
+def box_gap(ee: wp.bool, x0: wp.vec3d, x1: wp.vec3d, x2: wp.vec3d, x3: wp.vec3d) -> wp.float64:
+    """Gap [m] between the boxes of two edges (``ee``) or of a point and a triangle.
+
+    Negative where they overlap on every axis. The pair is no closer than that; it is less by a share of 1e-9 for rounding.
+    """
+    low, high, low2, high2 = x0, x0, wp.min(x2, x3), wp.max(x2, x3)
+    if ee:
+        low, high = wp.min(x0, x1), wp.max(x0, x1)
+    else:
+        low2, high2 = wp.min(low2, x1), wp.max(high2, x1)
+    gap = wp.max(low2 - high, low - high2)
+    return wp.float64(1.0 - 1.0e-9) * wp.max(wp.max(gap[0], gap[1]), gap[2])

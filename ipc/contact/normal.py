@@ -17,10 +17,10 @@ from __future__ import annotations
 import warp as wp
 
 from ipc.arrays import FloatArray, IntArray, MatArray2d, VecArray2d
-from ipc.broad_phase.lists import Candidates, Surface, pair_at, pair_vertices, pairs_of
+from ipc.broad_phase.lists import Candidates, Surface, gap_bounds, pair_at, pair_vertices, pairs_of
 from ipc.contact.barrier import barrier, barrier_first, barrier_second, mollifier, mollifier_first, mollifier_second
 from ipc.contact.contacts import Contacts, push_contact, push_matrix, push_row
-from ipc.contact.distance import pair_coefficients, separation
+from ipc.contact.distance import box_gap, pair_coefficients, separation
 
 wp.set_module_options({"enable_backward": False})
 
@@ -172,9 +172,14 @@ def contact_pairs(
     if active[env] == 0:
         return
     for i in range(lane, pairs_of(candidates, ee, env), lanes):
+        near, _most = gap_bounds(candidates, ee, env, i)
+        if near >= surface.d_hat:
+            continue
         item = pair_at(candidates, ee, env, i)
         verts = pair_vertices(surface, ee, item)
         x0, x1, x2, x3 = x[env, verts[0]], x[env, verts[1]], x[env, verts[2]], x[env, verts[3]]
+        if box_gap(ee, x0, x1, x2, x3) >= surface.d_hat:
+            continue
         Dh = surface.d_hat * surface.d_hat
         coef = pair_coefficients(ee, x0, x1, x2, x3)
         t = separation(coef, x0, x1, x2, x3)
@@ -226,6 +231,8 @@ def pair_energy(x: VecArray2d, surface: Surface, env: wp.int32, ee: wp.bool, pai
     """Energy of two edges (``ee``) or of a vertex and a face, over κ/d̂³ [m⁶]."""
     v = pair_vertices(surface, ee, pair)
     x0, x1, x2, x3 = x[env, v[0]], x[env, v[1]], x[env, v[2]], x[env, v[3]]
+    if box_gap(ee, x0, x1, x2, x3) >= surface.d_hat:
+        return wp.float64(0.0)
     b = barrier(wp.length_sq(separation(pair_coefficients(ee, x0, x1, x2, x3), x0, x1, x2, x3)), surface.d_hat * surface.d_hat)
     if b == wp.float64(0.0):
         return b
@@ -253,6 +260,9 @@ def energy_pairs(
     if active[env] == 0:
         return
     for i in range(lane, pairs_of(candidates, ee, env), lanes):
+        near, _most = gap_bounds(candidates, ee, env, i)
+        if near >= surface.d_hat:
+            continue
         pair = pair_at(candidates, ee, env, i)
         e = pair_energy(x1, surface, env, ee, pair) - pair_energy(x0, surface, env, ee, pair)
         if e != wp.float64(0.0):

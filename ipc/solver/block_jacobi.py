@@ -84,6 +84,8 @@ class BlockJacobi:
         eliminate: False: 3×3 blocks for the nodes of affine bodies too.
     """
 
+    on_host = False
+
     def __init__(self, layout: Layout, batch: int, lanes: int, device: wp.Device, eliminate: bool = True) -> None:
         self.lanes = lanes
         self.inverse = wp.zeros((batch, len(layout.node_rest)), dtype=wp.mat33d, device=device)

@@ -9,8 +9,6 @@ in frame coordinates with ỹ = Rᵀ(x̃ − t): there are no fictitious forces,
 
 from __future__ import annotations
 
-from typing import Any
-
 import warp as wp
 
 from ipc.arrays import FloatArray, FloatArray2d, IntArray, MatArray2d, QuatArray2d, VecArray, VecArray2d
@@ -195,17 +193,21 @@ def slope_of(p: VecArray2d, gradient: VecArray2d, slope: FloatArray2d):
     slope[env, i] = wp.dot(p[env, i], gradient[env, i])
 
 
+# Not one generic kernel: a recording on a CPU tells kernels apart by name (Warp 1.19), and would run either form for both types.
 @wp.kernel
-def take(y1: wp.array2d(dtype=Any), mask: IntArray, y: wp.array2d(dtype=Any)):
+def take_vectors(y1: VecArray2d, mask: IntArray, y: VecArray2d):
     """y = y1 where the mask is set."""
     env, i = wp.tid()
     if mask[env] != 0:
         y[env, i] = y1[env, i]
 
 
-# All types at once, so that the module is compiled only once.
-for _type in (wp.vec3d, wp.mat33d):
-    wp.overload(take, [wp.array2d(dtype=_type), IntArray, wp.array2d(dtype=_type)])
+@wp.kernel
+def take_matrices(R1: MatArray2d, mask: IntArray, R: MatArray2d):
+    """R = R1 where the mask is set."""
+    env, i = wp.tid()
+    if mask[env] != 0:
+        R[env, i] = R1[env, i]
 
 
 @wp.kernel

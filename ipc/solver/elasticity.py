@@ -198,9 +198,9 @@ def strain_energy_change(
     if model == 1:
         a = one + wp.float64(0.75) * mu / lam
         z = ic / (wp.ddot(F0, F0) + one)
-        log1p = wp.log(one + z)
-        if wp.abs(z) < wp.float64(1.0e-3):
-            log1p = z * (one - z * (half - z * (one / wp.float64(3.0) - z * (wp.float64(0.25) - z * wp.float64(0.2)))))
+        log1p = z * (one - z * (half - z * (one / wp.float64(3.0) - z * (wp.float64(0.25) - z * wp.float64(0.2)))))
+        if not (wp.abs(z) < wp.float64(1.0e-3)):
+            log1p = wp.log(one + z)
         return half * mu * (ic - log1p) + half * own * J * (both - wp.float64(2.0) * a) + barrier
     return half * mu * ic - mu * J + half * own * J * (both - wp.float64(2.0)) + barrier
 
@@ -274,6 +274,44 @@ def node_elastic_gradient(
     gradient[env, i] = g
 
 
+@wp.func
+def even_part(
+    model: wp.int32,
+    mu: wp.float64,
+    f: wp.vec4d,
+    ga: wp.vec3d,
+    gb: wp.vec3d,
+    ba: wp.vec3d,
+    bb: wp.vec3d,
+    ca: wp.vec3d,
+    cb: wp.vec3d,
+) -> wp.mat33d:
+    """Block of corners a and b over the volume [Pa/m²], but for its part with c.
+
+    b = F g and c = cof F g of the corners' g = ∇w.
+    """
+    one = wp.identity(n=3, dtype=wp.float64)
+    if model == 2:
+        # The Gauss-Newton part; (F Fᵀ − 1) stays tiny while the body is near-rigid, and is not always positive.
+        return (wp.float64(4.0) * mu) * (wp.dot(ba, bb) * one + wp.outer(bb, ba))
+    return (f[0] * wp.dot(ga, gb)) * one + f[2] * wp.outer(ba, bb) + f[3] * wp.outer(ca, cb)
+
+
+@wp.func
+def odd_part(model: wp.int32, f: wp.vec4d, F: wp.mat33d, ga: wp.vec3d, gb: wp.vec3d) -> wp.mat33d:
+    """Its part with c, which is antisymmetric and vanishes on the diagonal."""
+    if model == 2:
+        return wp.mat33d()
+    return -f[1] * wp.skew(F * wp.cross(ga, gb))
+
+
+@wp.func
+def inertia_block(masses: Masses, dt: FloatArray, env: wp.int32, k: wp.int32) -> wp.mat33d:
+    """Inertia and drag of block k [N/m]."""
+    h = dt[env] + wp.float64(0.0)
+    return (masses.inertia[k] * (wp.float64(1.0) / (h * h)) + masses.drag[k] / h) * wp.identity(n=3, dtype=wp.float64)
+
+
 @wp.kernel
 def block_hessian(
     upper: IntArray2d,
@@ -290,38 +328,128 @@ def block_hessian(
 ):
     """Blocks of the elastic and inertial Hessian [N/m], gathered from the elements.
 
-    Each row of ``upper`` names a block on or above the diagonal, where it is to lie, and where its transpose.
+    Each row of ``upper`` names a block on or above the diagonal, where it is to lie, and where its transpose. A thread a block, so that
+    sums have one order; :func:`add_element_blocks` computes the same on a CPU.
     """
     env, u = wp.tid()
     if active[env] == 0:
         return
     k = upper[u, 0]
-    one = wp.identity(n=3, dtype=wp.float64)
-    h = dt[env] + wp.float64(0.0)
-    H = (masses.inertia[k] * (wp.float64(1.0) / (h * h)) + masses.drag[k] / h) * one
+    H = inertia_block(masses, dt, env, k)
     for s in range(part_start[k], part_start[k + 1]):
         e = part[s] / 16
         code = part[s] - 16 * e
         ga = elements.grads[e, code / 4]
         gb = elements.grads[e, code % 4]
-        F = el_F[env, e]
-        f = el_mckl[env, e]
-        ba = F * ga
-        bb = F * gb
-        if elements.model[e] == 2:
-            # The Gauss-Newton part; (F Fᵀ − 1) stays tiny while the body is near-rigid, and is not always positive.
-            H += (wp.float64(4.0) * elements.mu[e] * elements.volume[e]) * (wp.dot(ba, bb) * one + wp.outer(bb, ba))
-        else:
-            C = cofactor(F)
-            H += elements.volume[e] * (
-                (f[0] * wp.dot(ga, gb)) * one
-                + f[2] * wp.outer(ba, bb)
-                + f[3] * wp.outer(C * ga, C * gb)
-                - f[1] * wp.skew(F * wp.cross(ga, gb))
-            )
+        F, f, model = el_F[env, e], el_mckl[env, e], elements.model[e]
+        C = cofactor(F)
+        even = even_part(model, elements.mu[e], f, ga, gb, F * ga, F * gb, C * ga, C * gb)
+        H += elements.volume[e] * (even + odd_part(model, f, F, ga, gb))
     blocks[env, upper[u, 1]] = H
     if upper[u, 2] != upper[u, 1]:
         blocks[env, upper[u, 2]] = wp.transpose(H)
+
+
+@wp.kernel
+def fill_inertia(upper: IntArray2d, masses: Masses, dt: FloatArray, active: IntArray, blocks: MatArray2d):
+    """Inertia and drag in the blocks ``upper``, on and above the diagonal [N/m]."""
+    env, u = wp.tid()
+    if active[env] != 0:
+        blocks[env, upper[u, 1]] = inertia_block(masses, dt, env, upper[u, 0])
+
+
+@wp.struct
+class Corner:
+    """A corner of an element: g = ∇w, b = F g, c = cof F g."""
+
+    g: wp.vec3d
+    b: wp.vec3d
+    c: wp.vec3d
+
+
+@wp.func
+def corner_of(elements: Elements, e: wp.int32, a: wp.int32, F: wp.mat33d, C: wp.mat33d) -> Corner:
+    g = elements.grads[e, a] + wp.vec3d()
+    return Corner(g, F * g, C * g)
+
+
+@wp.func
+def add_block(
+    place: wp.int32,
+    p: Corner,
+    q: Corner,
+    model: wp.int32,
+    mu: wp.float64,
+    f: wp.vec4d,
+    F: wp.mat33d,
+    env: wp.int32,
+    blocks: MatArray2d,
+):
+    """Add the block of two corners to ``place``.
+
+    A negative one is that of its transpose, less one and with the other sign.
+    """
+    even, odd = even_part(model, mu, f, p.g, q.g, p.b, q.b, p.c, q.c), odd_part(model, f, F, p.g, q.g)
+    if place >= 0:
+        blocks[env, place] = blocks[env, place] + (even + odd)
+    else:
+        blocks[env, -1 - place] = blocks[env, -1 - place] + (wp.transpose(even) - odd)
+
+
+@wp.func
+def add_diagonal(place: wp.int32, p: Corner, model: wp.int32, mu: wp.float64, f: wp.vec4d, env: wp.int32, blocks: MatArray2d):
+    """The same of one corner."""
+    blocks[env, place] = blocks[env, place] + even_part(model, mu, f, p.g, p.g, p.b, p.b, p.c, p.c)
+
+
+@wp.kernel
+def add_element_blocks(
+    places: IntArray2d,
+    elements: Elements,
+    el_F: MatArray2d,
+    el_mckl: Vec4Array2d,
+    active: IntArray,
+    # outputs
+    blocks: MatArray2d,
+):
+    """Add the elastic Hessian of every element to the blocks on and above the diagonal [N/m].
+
+    Only where threads run one after the other, as on a CPU. An element computes what its ten blocks share once, where
+    :func:`block_hessian` computes it for each block. Row e of ``places`` has those of its diagonal blocks and of its pairs of corners
+    01, 02, 03, 12, 13, 23, see :func:`add_block`.
+    """
+    env, e = wp.tid()
+    if active[env] == 0:
+        return
+    model, volume = elements.model[e] + 0, elements.volume[e] + wp.float64(0.0)
+    mu = volume * elements.mu[e]
+    f = volume * el_mckl[env, e]
+    F = el_F[env, e] + wp.mat33d()
+    C = cofactor(F)
+    p0, p1 = corner_of(elements, e, 0, F, C), corner_of(elements, e, 1, F, C)
+    p2, p3 = corner_of(elements, e, 2, F, C), corner_of(elements, e, 3, F, C)
+    add_diagonal(places[e, 0], p0, model, mu, f, env, blocks)
+    add_diagonal(places[e, 1], p1, model, mu, f, env, blocks)
+    add_diagonal(places[e, 2], p2, model, mu, f, env, blocks)
+    add_diagonal(places[e, 3], p3, model, mu, f, env, blocks)
+    add_block(places[e, 4], p0, p1, model, mu, f, F, env, blocks)
+    add_block(places[e, 5], p0, p2, model, mu, f, F, env, blocks)
+    add_block(places[e, 6], p0, p3, model, mu, f, F, env, blocks)
+    add_block(places[e, 7], p1, p2, model, mu, f, F, env, blocks)
+    add_block(places[e, 8], p1, p3, model, mu, f, F, env, blocks)
+    add_block(places[e, 9], p2, p3, model, mu, f, F, env, blocks)
+
+
+PAIRS = (0, 5, 10, 15, 1, 2, 3, 6, 7, 11)
+"""4·a + b of the pairs of corners in :func:`add_element_blocks`."""
+
+
+@wp.kernel
+def mirror_blocks(upper: IntArray2d, active: IntArray, blocks: MatArray2d):
+    """Transposes of the blocks above the diagonal to where they lie below it."""
+    env, u = wp.tid()
+    if active[env] != 0 and upper[u, 2] != upper[u, 1]:
+        blocks[env, upper[u, 2]] = wp.transpose(blocks[env, upper[u, 1]])
 
 
 @wp.kernel

@@ -164,6 +164,51 @@ def add_row(system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32, 
     return s * s
 
 
+SPREAD = wp.constant(-2)
+"""First node of a row that :func:`add_row` takes as it is: a vertex follows several nodes."""
+
+
+@wp.func
+def turn_row(system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32):
+    """Turn row r into bodies' frames: ``node_row`` at unknowns ``row_nodes``, −1 for none."""
+    verts, row = contacts.row_verts[env, r], contacts.row[env, r]
+    turned, nodes = mat34d(), wp.vec4i(-1, -1, -1, -1)
+    for k in range(4):
+        v = verts[k]
+        if v >= 0:
+            if system.verts.count[v] > 1:
+                contacts.row_nodes[env, r] = wp.vec4i(SPREAD, -1, -1, -1)
+                return
+            if system.verts.count[v] == 1:
+                node = system.verts.nodes[v, 0]
+                if system.free[node] != 0:
+                    q = system.verts.weight[v, 0] * (wp.transpose(system.R[env, system.verts.body[v]]) * row_column(row, k))
+                    nodes[k] = node
+                    for i in range(3):
+                        turned[i, k] = q[i]
+    contacts.row_nodes[env, r] = nodes
+    contacts.node_row[env, r] = turned
+
+
+@wp.func
+def add_turned_row(
+    system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32, p: VecArray2d, out: VecArray2d
+) -> wp.float64:
+    """The same as :func:`add_row`, with what :func:`turn_row` prepared."""
+    nodes = contacts.row_nodes[env, r]
+    if nodes[0] == SPREAD:
+        return add_row(system, contacts, env, r, p, out)
+    s = wp.float64(0.0)
+    row = contacts.node_row[env, r]
+    for k in range(4):
+        if nodes[k] >= 0:
+            s += wp.dot(row_column(row, k), p[env, nodes[k]])
+    for k in range(4):
+        if nodes[k] >= 0:
+            wp.atomic_add(out, env, nodes[k], s * row_column(row, k))
+    return s * s
+
+
 @wp.kernel
 def multiply_rows(
     system: SystemView,
@@ -217,6 +262,9 @@ def push_blocks(system: SystemView, lift: VecArray2d, active: IntArray, residual
 
 class Preconditioner(Protocol):
     """Approximates H⁻¹, symmetric and positive definite."""
+
+    on_host: bool
+    """Some of its work is NumPy's, which no recording takes in."""
 
     def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
         """Take in the matrix of the active environments; ``rows`` is the largest row count."""

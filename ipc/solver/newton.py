@@ -12,9 +12,9 @@ Eisenstat, Steihaug 1982), and to the linear tolerance only where p is so small 
 An environment is done when p is small and its frames have arrived, or are blocked. Its friction is then lagged again, as often as the
 settings say. Environments never wait on or change each other's arithmetic: every decision is a mask.
 
-The loop itself is made of conditional nodes, so that on CUDA a whole step is one graph launch without the host. On a CPU the same functions
-run as they stand. If a buffer was too small, the step halts before anything changes, the host lets the buffer grow, and the step goes on
-from there.
+The loop itself is made of conditional nodes, so that a whole step is one graph launch without the host: on a CPU, Warp goes through what
+was recorded in C++. If a buffer was too small, the step halts before anything changes, the host lets the buffer grow, and the step goes
+on from there.
 """
 
 from __future__ import annotations
@@ -53,15 +53,15 @@ class Newton:
         self._friction = int(potential.collision.friction)
         self._loose = max(settings.linear_tolerance, settings.forcing)
         self._graphs: dict[str, Any] = {}
-        self._recording = False
+        """Recordings by name of what was recorded; None for what ran once as it stands."""
         self.timers: dict[str, float] = {}
 
     # --- timing and recording --------------------------------------------------------------------------------------------------
 
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:
-        """Add a stage's time to ``timers``; nothing while it is recorded."""
-        if self._recording:
+        """Add a stage's time to ``timers``; a recorded step has no stages."""
+        if self._recorded():
             yield
             return
         start = time.perf_counter()
@@ -70,20 +70,28 @@ class Newton:
             wp.synchronize_device(self.device)
         self.timers[name] = self.timers.get(name, 0.0) + time.perf_counter() - start
 
+    def _recorded(self) -> bool:
+        return self.settings.graph and (self.device.is_cuda or not self.preconditioner.on_host)
+
     def _run(self, body: Callable[[], None]) -> None:
-        """Run ``body``, on CUDA from a recording made at the first call and after buffers grow."""
-        if not (self.device.is_cuda and self.settings.cuda_graph):
+        """Run ``body`` from a recording, which is made at the first call and after buffers grow.
+
+        On a CPU it is made at the second: a recording takes as long as two or three Newton iterations without it, and buffers often grow in
+        the first steps of a world.
+        """
+        if not self._recorded():
             body()
             return
         key = body.__name__
-        if key not in self._graphs:
-            wp.load_module("ipc", device=self.device, recursive=True)
-            self._recording = True
-            try:
-                with wp.ScopedCapture(device=self.device) as capture:
-                    body()
-            finally:
-                self._recording = False
+        if not self.device.is_cuda and key not in self._graphs:
+            self._graphs[key] = None
+            body()
+            return
+        if self._graphs.get(key) is None:
+            if self.device.is_cuda:
+                wp.load_module("ipc", device=self.device, recursive=True)
+            with wp.ScopedCapture(device=self.device) as capture:
+                body()
             self._graphs[key] = capture.graph
         wp.capture_launch(self._graphs[key])
 
@@ -241,8 +249,9 @@ class Newton:
         state.launch(decisions.start_advance)
         wp.capture_while(state.flags.shorten, self._try_advance)
         state.launch(decisions.conclude_advance, self.settings.blocked_advance, self.settings.poor_advance)
-        for old, new in ((pot.y, pot.y1), (pot.x, pot.x1), (pot.R, pot.R1), (pot.t, pot.t1)):
-            pot.launch(dynamics.take, old.shape, [new, d.accepted], [old])
+        for old, new in ((pot.y, pot.y1), (pot.x, pot.x1), (pot.t, pot.t1)):
+            pot.launch(dynamics.take_vectors, old.shape, [new, d.accepted], [old])
+        pot.launch(dynamics.take_matrices, pot.R.shape, [pot.R1, d.accepted], [pot.R])
         pot.aim_inertia(pot.R, pot.t)
 
     def _try_advance(self) -> None:
@@ -278,8 +287,8 @@ class Newton:
             state.launch(decisions.start_search, pot.reach)
             wp.capture_while(state.flags.search, self._try_step)
             state.launch(decisions.end_search)
-            pot.launch(dynamics.take, pot.y.shape, [pot.y1, d.accepted], [pot.y])
-            pot.launch(dynamics.take, pot.x.shape, [pot.x1, d.accepted], [pot.x])
+            pot.launch(dynamics.take_vectors, pot.y.shape, [pot.y1, d.accepted], [pot.y])
+            pot.launch(dynamics.take_vectors, pot.x.shape, [pot.x1, d.accepted], [pot.x])
 
     def _try_step(self) -> None:
         pot, state = self.potential, self.state
@@ -303,7 +312,7 @@ class Newton:
         pot, state = self.potential, self.state
         d = state.decisions
         with self._stage("end"):
-            pot.launch(dynamics.take, pot.y.shape, [pot.y_start, d.accepted], [pot.y])
+            pot.launch(dynamics.take_vectors, pot.y.shape, [pot.y_start, d.accepted], [pot.y])
             pot.place_nodes(pot.xw1)
             pot.launch(dynamics.new_velocity, pot.xw.shape, [pot.xw1, pot.xw, pot.dt, d.good], [pot.v])
             pot.set_frames(d.progress, pot.R, pot.t)

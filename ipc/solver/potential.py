@@ -113,6 +113,7 @@ class Potential:
         above = np.flatnonzero(layout.col >= rows)
         mirror = np.searchsorted(rows * nodes + layout.col, layout.col[above].astype(np.int64) * nodes + rows[above])
         self.upper = ints(np.stack([above, self.where[above], self.where[mirror]], axis=1))
+        self.places = ints(_element_places(layout, rows, self.where))
         rows_at = {"row_base": base, "row_length": np.diff(layout.row_start)}
         rows_at |= {name: getattr(layout, name) for name in ("block_pair_start", "pair_block", "pair_node")}
         rows_at |= {name: getattr(layout, name) for name in ("node_pair_start", "node_pair")}
@@ -216,11 +217,18 @@ class Potential:
 
     def fill_matrix(self, active: wp.array) -> None:
         """Inertia and elasticity, from results of :meth:`evaluate_elements`."""
-        inputs = [
-            *(self.upper, self.part_start, self.part, self.elements, self.masses, self.dt),
-            *(self.el_F, self.el_mckl, active),
-        ]
-        self.launch(elasticity.block_hessian, (self.batch, len(self.upper)), inputs, [self.system.blocks])
+        blocks, dim = self.system.blocks, (self.batch, len(self.upper))
+        if self.device.is_cuda:
+            inputs = [
+                *(self.upper, self.part_start, self.part, self.elements, self.masses, self.dt),
+                *(self.el_F, self.el_mckl, active),
+            ]
+            self.launch(elasticity.block_hessian, dim, inputs, [blocks])
+        else:
+            self.launch(elasticity.fill_inertia, dim, [self.upper, self.masses, self.dt, active], [blocks])
+            inputs = [self.places, self.elements, self.el_F, self.el_mckl, active]
+            self.launch(elasticity.add_element_blocks, self.el_J.shape, inputs, [blocks])
+            self.launch(elasticity.mirror_blocks, dim, [self.upper, active], [blocks])
         if self.volume_blocks:
             inputs, row = [self.elements, self.volumes, self.el_F, active], self.system.volume_row
             self.launch(dilation.dilation_rows, row.shape, inputs, [row])
@@ -278,3 +286,18 @@ class Potential:
         self.reduce(self.el_energy, self.everyone, SUM, self.elastic_energy)
         self.launch(dynamics.kinetic_energy, self.v.shape, [self.v, self.masses], [self.node_change])
         self.reduce(self.node_change, self.everyone, SUM, self.kinetic)
+
+
+def _element_places(layout: Layout, rows: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """Places (E, 10) of the elements' blocks as in ``elasticity.add_element_blocks``.
+
+    Args:
+        rows: row of each block of the matrix (K,).
+        where: place of each block (K,).
+    """
+    blocks = np.empty(16 * len(layout.tets), np.int64)
+    blocks[layout.part] = np.repeat(np.arange(len(layout.col)), np.diff(layout.part_start))
+    blocks = blocks.reshape(-1, 16)
+    ab = np.array(elasticity.PAIRS)
+    straight, turned = blocks[:, ab], blocks[:, 4 * (ab % 4) + ab // 4]
+    return np.where(rows[straight] <= layout.col[straight], where[straight], -1 - where[turned])

@@ -49,7 +49,7 @@ def test_bad_options_are_refused_before_anything_is_written(
 
 def test_press_is_timed_for_each_size_and_number_of_environments(small: dict[str, ModuleType], tmp_path: Path) -> None:
     bench = small["bench_ipc"]
-    assert bench.main(bench.Args(out=tmp_path, device="cpu", sizes="300,5300", envs="1,3", spread=0.5)) == 0
+    assert bench.main(bench.Args(out=tmp_path, device="cpu", sizes="300,5300", envs="1,3", spread=0.5, stages=True)) == 0
     found = read_metrics(tmp_path / "metrics.json")
     numbers = {key: float(value) for key, value in found.items() if not isinstance(value, str)}
     for key in ("cpu.300", "cpu.300x3", "cpu.5300"):
@@ -63,6 +63,23 @@ def test_press_is_timed_for_each_size_and_number_of_environments(small: dict[str
     assert numbers["cpu.300x3.env_steps_per_s"] > 0
     # Each environment goes less deep than it might: with differing depths the most loaded is the deepest.
     assert numbers["cpu.300x3.force_n"] > numbers["cpu.300.force_n"]
+
+
+def test_a_checkout_is_compared_with_one_that_is_there(modules: dict[str, ModuleType], tmp_path: Path) -> None:
+    bench = modules["bench_ipc"]
+    with pytest.raises(InputError, match="must be a checkout of this project"):
+        bench.main(bench.Args(out=tmp_path / "out", sizes="300", against=tmp_path))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_steps_of_a_checkout_in_turn_with_its_own(modules: dict[str, ModuleType], tmp_path: Path) -> None:
+    bench = modules["bench_ipc"]
+    bench.main(bench.Args(out=tmp_path, sizes="300", against=EXPERIMENTS.parent))
+    found = read_metrics(tmp_path / "metrics.json")
+    ratios = [float(value) for key, value in found.items() if key.startswith("cpu.300.speedup_vs_")]
+    assert len(ratios) == 1 and 0.5 < ratios[0] < 2.0
+    assert float(found["cpu.300.speedup_least"]) <= float(found["cpu.300.speedup_most"])
 
 
 def test_a_measurement_stops_when_its_time_is_up(small: dict[str, ModuleType], tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ def test_a_recorded_step_equals_single_launches_and_survives_growth() -> None:
     results = []
     for graph, room in ((True, None), (False, None), (True, 1)):
         ball = ipc.KinematicBody("ball", ipc.icosphere(4e-3, 2), ipc.Pose((1e-4, 2e-4, 4e-3 + 1.2e-4)))
-        settings = ipc.Settings(d_hat=1e-4, friction=0.5, velocity_tolerance=1e-8, linear_tolerance=1e-8, cuda_graph=graph)
+        settings = ipc.Settings(d_hat=1e-4, friction=0.5, velocity_tolerance=1e-8, linear_tolerance=1e-8, graph=graph)
         world = ipc.World([bonded_pad(small_pad()), ball], settings, num_envs=3, device="cuda")
         if room:
             world._potential.collision._size_candidates(room, room)

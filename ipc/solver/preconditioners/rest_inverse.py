@@ -249,7 +249,7 @@ class RestInverse:
         max_contacts: int = MAX_CONTACTS,
         patches: int | None = None,
     ) -> None:
-        self.batch, self.device = batch, device
+        self.batch, self.device, self.on_host = batch, device, not device.is_cuda
         count = len(layout.node_rest)
         blocks = rest_blocks(layout, settings)
         bodies = [condense(layout, blocks, *choose_partition(layout, body, patches)) for body in bonded_bodies(layout)]

@@ -247,7 +247,7 @@ def test_cuda_takes_the_same_steps(graph: bool) -> None:
     options: dict = {"gravity": G, "friction": 0.3, "d_hat": 1e-4, "linear_tolerance": 1e-6, "velocity_tolerance": 1e-6}
     ends = []
     for device in ("cpu", "cuda"):
-        settings = ipc.Settings(**options, cuda_graph=graph, preconditioner="block_jacobi")
+        settings = ipc.Settings(**options, graph=graph, preconditioner="block_jacobi")
         world = ipc.World(list(bodies), settings, num_envs=4, device=device)
         reports = [world.step() for _ in range(4)]
         assert all(r.converged.all() for r in reports)

@@ -10,6 +10,7 @@ import warp as wp
 
 import ipc
 from ipc.bodies import build_layout
+from ipc.solver import elasticity
 from ipc.solver.potential import Potential
 from tests.ipc.conftest import unit_cell
 
@@ -89,6 +90,23 @@ def test_gradient_and_hessian_match_finite_differences(model: Model, height: flo
     assert np.abs(g - g_fd).max() / np.abs(g).max() < 1e-8
     assert np.abs(H - H_fd).max() / np.abs(H).max() < 1e-8
     assert np.abs(H - H.T).max() / np.abs(H).max() < 1e-14
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_blocks_are_the_same_summed_by_elements_and_gathered(model: Model, rng: np.random.Generator) -> None:
+    """The form of a CPU, whose blocks are their transposes bit for bit, and that of CUDA."""
+    solver = make_potential(ipc.Material(1e5, 0.4, model=model))
+    y = solver.layout.node_rest + 0.1 * rng.standard_normal(solver.layout.node_rest.shape)
+    gradient_at(solver, y)
+    solver.fill_matrix(solver.everyone)
+    summed = dense(solver)
+    assert np.array_equal(summed, summed.T) and np.linalg.norm(summed) > 1e4
+    solver.system.blocks.zero_()
+    inputs = [solver.upper, solver.part_start, solver.part, solver.elements, solver.masses, solver.dt]
+    inputs += [solver.el_F, solver.el_mckl, solver.everyone]
+    solver.launch(elasticity.block_hessian, (1, len(solver.upper)), inputs, [solver.system.blocks])
+    gathered = dense(solver)
+    assert np.abs(summed - gathered).max() < 1e-14 * np.abs(gathered).max()
 
 
 @pytest.mark.parametrize("model", MODELS)

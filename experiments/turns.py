@@ -1,0 +1,188 @@
+"""Steps of this checkout and of another one, in turn: how much faster is one of them, on a machine that others use too?
+
+    git worktree add --detach ../raytac_b682ef2 b682ef2
+    python experiments/bench_ipc.py --sizes 300,1400 --against ../raytac_b682ef2 --out runs/bench_ipc_against
+    python experiments/bench_soft.py --levels coarse --against ../raytac_b682ef2 --out runs/bench_soft_against
+
+Each checkout has a process of its own, which waits while the other makes its step: a load that comes and goes slows both alike. What is
+compared is processor time. The scenes are those of this checkout, made with what both offer; each process runs
+
+    PYTHONPATH=CHECKOUT python experiments/turns.py SCENE
+
+and answers a line on its input by a line with the processor time of its next step [s].
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+# Nothing of the package is imported here: it would be this checkout's.
+
+ROUNDS = 3
+"""Runs of a scene; the first compiles and is not counted."""
+
+
+class Turn:
+    """A checkout's process."""
+
+    def __init__(self, checkout: Path, scene: str) -> None:
+        threads = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
+        self._process = subprocess.Popen(
+            [sys.executable, str(Path(__file__).resolve()), scene],
+            cwd=checkout,
+            env={**os.environ, **threads, "PYTHONPATH": str(checkout)},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def step(self) -> float:
+        """Processor time of the next step [s]; NaN for one that is not counted.
+
+        Raises ``ChildProcessError``: the process ended, with its last line.
+        """
+        assert self._process.stdin is not None and self._process.stdout is not None and self._process.stderr is not None
+        try:
+            self._process.stdin.write("\n")
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            pass
+        for line in self._process.stdout:
+            if line.startswith("seconds "):
+                return float(line.split()[1])
+        last = (self._process.stderr.read().strip() or "no message").splitlines()[-1]
+        raise ChildProcessError(f"the step process ended with {self._process.wait()}: {last}")
+
+    def end(self) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+
+def speedup(ours: Path, theirs: Path, scene: str, rounds: int = ROUNDS) -> dict[str, float]:
+    """Times of a scene's steps, a turn each, and how many times this checkout is faster.
+
+    Returns:
+        ``ms``, ``their_ms``: medians over the counted steps.    ``speedup``: ratio of the two.    ``least``, ``most``: of single rounds.
+    """
+    steps = steps_of(scene)
+    turns = [Turn(ours, scene), Turn(theirs, scene)]
+    times = np.empty((rounds, steps, 2))
+    try:
+        for k in range(rounds * steps):
+            order = (0, 1) if k % 2 == 0 else (1, 0)
+            for which in order:
+                times[k // steps, k % steps, which] = turns[which].step()
+    finally:
+        for turn in turns:
+            turn.end()
+    counted = 1e3 * times[1:]
+    mine, other = np.nanmedian(counted, axis=(0, 1))
+    single = np.divide(*np.nanmedian(counted, axis=1).T[::-1])
+    return {
+        "ms": float(mine),
+        "their_ms": float(other),
+        "speedup": float(other / mine),
+        "least": float(single.min()),
+        "most": float(single.max()),
+    }
+
+
+def in_turn(against: Path, scenes: dict[str, str]) -> dict[str, str | int | float | bool]:
+    """Metrics of scenes by their keys; prints a line for each.
+
+    Raises ``InputError``: no checkout of this project.
+    """
+    from raytac.errors import InputError, RaytacError
+
+    ours, theirs = Path(__file__).resolve().parents[1], against.resolve()
+    if not (theirs / "ipc" / "world.py").is_file():
+        raise InputError("against", value=against, rule="must be a checkout of this project")
+    name = commit(theirs)
+    metrics: dict[str, str | int | float | bool] = {"against": name, "commit": commit(ours)}
+    for key, scene in scenes.items():
+        try:
+            values = speedup(ours, theirs, scene)
+        except ChildProcessError as error:
+            raise RaytacError(f"{scene}: {error}") from error
+        metrics |= {f"{key}.processor_ms_per_step": values["ms"], f"{key}.processor_ms_per_step_{name}": values["their_ms"]}
+        metrics |= {f"{key}.speedup_vs_{name}": values["speedup"]}
+        metrics |= {f"{key}.speedup_least": values["least"], f"{key}.speedup_most": values["most"]}
+        print(
+            f"{key}: {values['ms']:.1f} ms against {values['their_ms']:.1f} of {name}, {values['speedup']:.2f} times", flush=True
+        )
+    return metrics
+
+
+def commit(checkout: Path) -> str:
+    """Short name of a checkout's commit; the folder's name where git knows none."""
+    ended = subprocess.run(["git", "rev-parse", "--short=7", "HEAD"], cwd=checkout, capture_output=True, text=True, check=False)
+    return ended.stdout.strip() if ended.returncode == 0 else checkout.name
+
+
+def steps_of(scene: str) -> int:
+    """Steps of a round."""
+    return {"press": 20, "pad": 9}[scene.partition(":")[0]]
+
+
+def press(size: str) -> Iterator[Callable[[], object]]:
+    """Steps of the press of ``bench_ipc``, rounds without end; ``size``: about how many vertices."""
+    from bench_ipc_scenes import CELLS, D_HAT, DT, FRICTION, GAP, PRESS, RADIUS, ball_height, press_world
+
+    import ipc
+
+    assert steps_of("press") == PRESS
+    world = press_world(CELLS[int(size)], ipc.Settings(dt=DT, d_hat=D_HAT, friction=FRICTION), 1, "cpu", "alike")
+    while True:
+        world.set_target("ball", (0.0, 0.0, RADIUS + GAP))
+        world.reset()
+        for k in range(PRESS):
+            world.set_target("ball", (0.0, 0.0, ball_height(k)))
+            yield world.step
+
+
+def pad(level: str) -> Iterator[Callable[[], object]]:
+    """Steps of the press of ``bench_soft`` with image; nine a round, the first at rest."""
+    from raytac.sensor import TactileSensor
+    from raytac.specs import StageSpec, load_press, load_sensor
+
+    try:
+        from raytac.physics import Ipc
+
+        soft = {"physics": Ipc(level)}
+    except ImportError:  # an older checkout
+        soft = {"physics": "ipc", "pad": level}
+    scene = load_press("sphere")
+    scene = replace(scene, trajectory=(StageSpec("indent", depth=0.8e-3),), object=replace(scene.object, dynamics="kinematic"))
+    sensor = TactileSensor(load_sensor("gelsight_mini"), device="cpu", seed=0, **soft)
+    sensor.rest()
+    loaded = sensor.load(scene)
+    while True:
+        states = loaded.run(8)
+        for _ in range(steps_of("pad")):
+            yield lambda states=states: sensor.update(next(states))
+
+
+def main(scene: str) -> None:
+    """Make a step for every line of the input."""
+    kind, _, size = scene.partition(":")
+    first = {"press": 0, "pad": 2}[kind]  # steps of a round that are not counted: at rest, and before anything touches
+    for k, step in enumerate({"press": press, "pad": pad}[kind](size)):
+        if not sys.stdin.readline():
+            return
+        began = time.process_time()
+        step()
+        seconds = time.process_time() - began
+        print("seconds", seconds if k % steps_of(scene) >= first else "nan", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
