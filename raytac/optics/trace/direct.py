@@ -16,7 +16,7 @@ from raytac.specs.sensor import CoatSpec, LedSpec
 
 SMALL = np.deg2rad(25.0)
 """Angle up to which an LED's edge is one point of the quadrature."""
-STEP = np.deg2rad(35.0)
+STEP = np.deg2rad(70.0)
 """Angle of an LED's edge that a further point covers."""
 
 

@@ -29,21 +29,26 @@ from raytac.optics.trace.direct import arrival
 from raytac.optics.trace.led import Lamp
 from raytac.specs.sensor import LedSpec
 
-COARSER = 2
-"""Spacing of the grid's nodes over that of the pad's."""
+COARSER = 1.5
+"""Spacing of the grid's nodes over that of the pad's, if an LED is extended."""
 BLOCK = 2
-"""Nodes of a block along each side; each takes its own part of the directions."""
-STEP = np.deg2rad(15.0)
-"""Most of a strip, as an angle seen from the middle of the pad, that a node takes in one step."""
-
+"""Nodes of a block along each side, likewise; each takes its own part of the directions."""
+EXTENDED = np.deg2rad(12.0)
+"""Angle of an LED, seen from the middle of the pad, from which it is extended; others cast edges."""
+STEP = np.deg2rad(30.0)
+"""Most of such an angle that a node takes in one step."""
 MARGIN = 4e-3
 """Width [m] about a crop in which shadows count too, for the light that the coat casts on itself."""
 
 
-def directions(led: LedSpec, refinement: int = 1) -> int:
-    """Number of directions in which a node of the grid looks for ``led``: one for each ``STEP``."""
-    distance = float(np.linalg.norm(led.position))
-    return refinement * max(1, int(np.ceil(2 * np.arctan(max(led.size) / 2 / distance) / STEP)))
+_BINOMIAL = ((-1, 0.25), (0, 0.5), (1, 0.25))
+_FILTER = {1: ((0, 0, 1.0),), BLOCK: tuple((a, b, wa * wb) for a, wa in _BINOMIAL for b, wb in _BINOMIAL)}
+"""Rows, columns and weights of the filter, by the side of a block."""
+
+
+def angle(led: LedSpec) -> float:
+    """Angle [rad] that the longer edge of ``led`` spans, seen across it from the middle of the pad."""
+    return 2 * float(np.arctan2(max(led.size) / 2, np.linalg.norm(led.position)))
 
 
 @dataclass(frozen=True)
@@ -55,15 +60,18 @@ class ShadowGrid:
     """Nodes in view: first column, first row, columns, rows."""
     counts: tuple[int, ...]
     """Directions a node and LED."""
+    block: int
+    """``BLOCK``, or 1 if no LED is extended."""
 
     @classmethod
     def build(cls, layout: CoatLayout, camera: Pinhole, thickness: float, leds: Sequence[LedSpec], refinement: int) -> ShadowGrid:
         """Grid over a pad of ``thickness`` [m], for ``refinement`` times the usual directions."""
-        nx, ny = (max(2, round((n - 1) / COARSER) + 1) for n in (layout.nx, layout.ny))
+        extended = any(angle(led) > EXTENDED for led in leds)
+        nx, ny = (max(2, round((n - 1) / (COARSER if extended else 1)) + 1) for n in (layout.nx, layout.ny))
         dx, dy = (layout.nx - 1) * layout.dx / (nx - 1), (layout.ny - 1) * layout.dy / (ny - 1)
         nodes = NodeGrid(nx, ny, layout.x0, layout.y0, dx, dy)
-        counts = tuple(directions(led, refinement) for led in leds)
-        return cls(nodes, _window(nodes, camera, thickness), counts)
+        counts = tuple(refinement * max(1, int(np.ceil(angle(led) / STEP))) for led in leds)
+        return cls(nodes, _window(nodes, camera, thickness), counts, BLOCK if extended else 1)
 
     @property
     def memory_per_env(self) -> int:
@@ -79,26 +87,24 @@ class ShadowGrid:
         x, y = g.x0 + g.dx * mi.Float(ix), g.y0 + g.dy * mi.Float(iy)
         p = mi.Point3f(x, y, field.z(env, x, y))
         here = PixelSample(env, p, field.normal(env, x, y), mi.Vector3f(0, 0, -1))
-        part = (mi.Float(BLOCK * (iy % BLOCK) + ix % BLOCK) + 0.5) / BLOCK**2
+        part = (mi.Float(self.block * (iy % self.block) + ix % self.block) + 0.5) / self.block**2
         sums = [self._seen(mi, field, here, lamp, count, part, slab) for lamp, count in zip(lamps, self.counts, strict=True)]
         packets = [_packets(mi, [pair[k] for pair in sums]) for k in (0, 1)]
         dr.eval(packets)
         column, row = mi.Int32(i % columns), mi.Int32((i // columns) % rows)
-        filtered = [[mi.Vector4f(0) for _ in kind] for kind in packets]
-        for a, wa in ((-1, 0.25), (0, 0.5), (1, 0.25)):
-            for b, wb in ((-1, 0.25), (0, 0.5), (1, 0.25)):
-                at = mi.UInt32(dr.clip(row + a, 0, rows - 1) * columns + dr.clip(column + b, 0, columns - 1)) + env * (columns * rows)
-                for kind, total in zip(packets, filtered, strict=True):
-                    for k, packet in enumerate(kind):
-                        total[k] += wa * wb * dr.gather(mi.Vector4f, packet, at)
+        sums_of = [[mi.Vector4f(0) for _ in kind] for kind in packets]
+        for a, b, weight in _FILTER[self.block]:
+            at = mi.UInt32(dr.clip(row + a, 0, rows - 1) * columns + dr.clip(column + b, 0, columns - 1)) + env * (columns * rows)
+            for kind, total in zip(packets, sums_of, strict=True):
+                for k, packet in enumerate(kind):
+                    total[k] += weight * dr.gather(mi.Vector4f, packet, at)
         # A node that faces away from an LED has no share of it; neighbours then count alone.
-        result = [dr.ravel(dr.select(whole > 0, seen / whole, 1)) for seen, whole in zip(*filtered, strict=True)]
+        result = [dr.ravel(dr.select(whole > 0, seen / whole, 1)) for seen, whole in zip(*sums_of, strict=True)]
         dr.eval(result)
         return result
 
-    @staticmethod
     def _seen(
-        mi: Any, field: CoatField, here: PixelSample, lamp: Lamp, count: int, part: Any, slab: Slab | None
+        self, mi: Any, field: CoatField, here: PixelSample, lamp: Lamp, count: int, part: Any, slab: Slab | None
     ) -> tuple[Any, Any]:
         """(light with shadows, light without) of one LED at the nodes, for unit power."""
         seen, whole, sight = mi.Float(0), mi.Float(0), lamp.sight(mi, here.p)
@@ -107,7 +113,7 @@ class ShadowGrid:
             light = arrival(mi, here, lamp, lamp.point(u, 0), slab)
             gain = light.gain * density
             # Its own part of the longer edge, and the whole shorter one, across the ray in the vertical plane.
-            half = density / (count * BLOCK**2) * dr.abs(dr.dot(light.up, lamp.half_u)) + dr.abs(dr.dot(light.up, lamp.half_v))
+            half = density / (count * self.block**2) * dr.abs(dr.dot(light.up, lamp.half_u)) + dr.abs(dr.dot(light.up, lamp.half_v))
             tan_half = dr.maximum(half * light.turn, 1e-4)
             seen += gain * field.visibility(here.env, here.p, light.target, tan_half, gain > 0)
             whole += gain
