@@ -35,7 +35,7 @@ BLOCK = 2
 """Nodes of a block along each side, likewise; each takes its own part of the directions."""
 EXTENDED = np.deg2rad(12.0)
 """Angle of an LED, seen from the middle of the pad, from which it is extended; others cast edges."""
-STEP = np.deg2rad(30.0)
+STEP = np.deg2rad(20.0)
 """Most of such an angle that a node takes in one step."""
 MARGIN = 4e-3
 """Width [m] about a crop in which shadows count too, for the light that the coat casts on itself."""
