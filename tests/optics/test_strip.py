@@ -69,7 +69,9 @@ PANEL = led("panel", (-12.5e-3, 0.0, -8e-3), (0.0, 0.0, -6e-3), size=(14e-3, 4e-
 
 
 @pytest.mark.parametrize("options", [DIRECT, {"integrator": "reference", "max_depth": 1, "spp": 256}], ids=["fast", "reference"])
-@pytest.mark.parametrize(("lamp", "formula"), [(STRIP, line_irradiance), (PANEL, rectangle_irradiance)], ids=["line", "rectangle"])
+@pytest.mark.parametrize(
+    ("lamp", "formula"), [(STRIP, line_irradiance), (PANEL, rectangle_irradiance)], ids=["line", "rectangle"]
+)
 def test_a_strip_over_a_flat_pad_is_its_closed_form(tracer: Build, options: dict, lamp: LedSpec, formula) -> None:
     spec = sensor([lamp])
     mode = tracer(spec, **options)
@@ -136,7 +138,9 @@ def ring(each: int, length: float) -> tuple[LedSpec, ...]:
             x, y = turn @ [-10e-3, 20e-3 * ((m + 0.5) / each - 0.5)]
             out = turn @ [1.0, 0.0]
             aim = (x + out[0], y + out[1], -2.5e-3)
-            leds.append(led(f"l{k}{m}", (float(x), float(y), -2.5e-3), aim, size=(length, SMALL[1]), power=(1.0 / each,) * 3))
+            leds.append(
+                led(f"l{k}{m}", (float(x), float(y), -2.5e-3), aim, size=(length, SMALL[1]), power=(1 / each, 1 / each, 1 / each))
+            )
     return tuple(replace(lamp, layer="all") for lamp in leds)
 
 
@@ -184,7 +188,7 @@ def test_a_strip_is_the_limit_of_many_points(tracer: Build) -> None:
     def points(count: int) -> np.ndarray:
         """Mean over the images of ``count`` points, eight to an image."""
         leds = [replace(lamp, layer="all") for lamp in ring(count, SMALL[0])[:count]]
-        spec, shares, weights = low_sensor(()), 0.0, 0.0
+        spec, shares, weights = low_sensor(()), np.zeros(()), np.zeros(())
         grid = grid_of(spec, PITCH)
         for k in range(0, count, 8):
             mode = tracer(replace(spec, lights=LightsSpec(tuple(leds[k : k + 8]))), pitch=PITCH, resolution=SEEN, **DIRECT)

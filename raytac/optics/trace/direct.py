@@ -72,7 +72,13 @@ def arrival(mi: Any, seen: PixelSample, lamp: Lamp, light: Any, slab: Slab | Non
 
 
 def direct_light(
-    mi: Any, coat: CoatSpec, seen: PixelSample, lamp: Lamp, points: tuple[int, int], specular: bool = True, slab: Slab | None = None
+    mi: Any,
+    coat: CoatSpec,
+    seen: PixelSample,
+    lamp: Lamp,
+    points: tuple[int, int],
+    specular: bool = True,
+    slab: Slab | None = None,
 ) -> tuple[Any, Any]:
     """(diffuse, specular) transport of one LED to every pixel, by power and reflectance.
 

@@ -5,8 +5,8 @@ points on its rectangle (Kajiya 1986, eq. 1 restricted to one bounce; area form 
 
     L_o(p) = Σ_led V_led · Σ_k w_k · f(p, ω_k, ω_o) · I(θ_k) · cos θ_p / r_k²
 
-with the LED's intensity I(θ) = power · cosⁿ θ, the coat's reflectance f and the share V of the LED that p sees (``ShadowGrid``). Everything runs in Dr.Jit, batched over
-environments: one thread a pixel, one code for LLVM and CUDA.
+with the LED's intensity I(θ) = power · cosⁿ θ, the coat's reflectance f and the share V of the LED that p sees (``ShadowGrid``).
+Everything runs in Dr.Jit, batched over environments: one thread a pixel, one code for LLVM and CUDA.
 """
 
 from __future__ import annotations
@@ -149,7 +149,9 @@ class FastTracer(Tracer):
                 out[k] += e * ((diffuse_albedo[k % 3] + coat.specular) / dr.pi)
         return out if seen.exit is None else [o * seen.exit for o in out]
 
-    def _sources(self, inputs: FrameInputs, shares: list[Any] | None, seen: PixelSample) -> Iterator[tuple[Lamp, LedSpec, int, Any]]:
+    def _sources(
+        self, inputs: FrameInputs, shares: list[Any] | None, seen: PixelSample
+    ) -> Iterator[tuple[Lamp, LedSpec, int, Any]]:
         """Lamp, LED, layer and visible share at ``seen`` of every LED."""
         leds, shadow = self.sensor.lights.leds, inputs.own.shadow
         visible = [1.0] * len(leds) if shadow is None else shadow.at(self.mi, shares, seen)

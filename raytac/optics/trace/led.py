@@ -109,6 +109,7 @@ class Lamp:
         cos_theta = dr.dot(direction, self.axis)
         return dr.select(cos_theta > 0, lobe_gain(dr, cos_theta, self.lobe), 0)
 
+
 _PICKED = ("centre", "axis", "half_u", "half_v", "lobe", "power")
 """Fields of ``Lamp`` that a path needs of an LED that it picks."""
 

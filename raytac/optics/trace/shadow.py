@@ -1,12 +1,12 @@
 """Cast shadows of extended lights: the share of every LED that each place of the coat sees.
 
-A strip of light casts no edge but a penumbra as wide as the strip. Its visible share at a place p of the coat is an integral over the strip,
+A strip of light casts no edge but a penumbra as wide as the strip. Its visible share at a place p of the coat is an integral,
 
     V(p) = ∫ g(φ) S(φ) dφ / ∫ g(φ) dφ,
 
-over the angle φ at which p sees the points of the strip's longer edge, with the light g that p would get from there and the share S of the
-shorter edge above the horizon in that direction (``CoatField.visibility``). Equal steps of φ put the nodes where the light comes from (equi-angular
-sampling; Kulla and Fajardo, Importance sampling techniques for path tracing in participating media, EGSR 2012, section 4).
+over the angle φ at which p sees the points of the strip's longer edge. g is the light that p would get from there, S the share of the
+shorter edge above the horizon in that direction (``CoatField.visibility``). Equal steps of φ put the nodes where the light comes from
+(equi-angular sampling; Kulla and Fajardo, Importance sampling techniques for path tracing in participating media, EGSR 2012, section 4).
 
 V is computed on a grid over the pad, not for each pixel, and interpolated. Neighbours of a 2 × 2 block take nodes a quarter of a step apart
 (interleaved sampling; Keller and Heidrich, EGWR 2001), and a binomial filter of 3 × 3 nodes, which has no response at the block's period,
@@ -35,7 +35,7 @@ BLOCK = 2
 """Nodes of a block along each side, likewise; each takes its own part of the directions."""
 EXTENDED = np.deg2rad(12.0)
 """Angle of an LED, seen from the middle of the pad, from which it is extended; others cast edges."""
-STEP = np.deg2rad(20.0)
+STEP = np.deg2rad(27.0)
 """Most of such an angle that a node takes in one step."""
 MARGIN = 4e-3
 """Width [m] about a crop in which shadows count too, for the light that the coat casts on itself."""
@@ -113,7 +113,9 @@ class ShadowGrid:
             light = arrival(mi, here, lamp, lamp.point(u, 0), slab)
             gain = light.gain * density
             # Its own part of the longer edge, and the whole shorter one, across the ray in the vertical plane.
-            half = density / (count * self.block**2) * dr.abs(dr.dot(light.up, lamp.half_u)) + dr.abs(dr.dot(light.up, lamp.half_v))
+            half = density / (count * self.block**2) * dr.abs(dr.dot(light.up, lamp.half_u)) + dr.abs(
+                dr.dot(light.up, lamp.half_v)
+            )
             tan_half = dr.maximum(half * light.turn, 1e-4)
             seen += gain * field.visibility(here.env, here.p, light.target, tan_half, gain > 0)
             whole += gain
