@@ -46,7 +46,7 @@ class Arrival:
     gain: Any
     """cosⁿ θ_led cos θ / r² of it [1/m²], refracted if there is a slab; 0 behind either surface."""
     target: Any
-    """End of the straight part of its path at the coat: the LED's point or that of the slab's face."""
+    """End of its last straight stretch: the LED's point, or that of the slab's face."""
     up: Any
     """Unit direction at the LED across the ray, in the vertical plane."""
     turn: Any
@@ -54,7 +54,7 @@ class Arrival:
 
 
 def arrival(mi: Any, seen: PixelSample, lamp: Lamp, light: Any, slab: Slab | None) -> Arrival:
-    """Light of the point ``light`` [m] of ``lamp`` at ``seen``, through the face of ``slab`` if any."""
+    """Light of a point of ``lamp``, ``light`` [m], at ``seen``, through ``slab`` if any."""
     if slab is None:
         d = light - seen.p
         r2 = dr.squared_norm(d)

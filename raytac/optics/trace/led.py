@@ -33,7 +33,7 @@ def lobe_slopes(cos_theta: np.ndarray, exponent: float, least: float) -> tuple[n
 
 @dataclass(frozen=True)
 class Sight:
-    """A segment of half length ``half`` as a point p sees it: it spans ``span`` from ``start`` [rad].
+    """A segment of half length ``half`` that spans ``span`` [rad] from ``start``, seen from p.
 
     Angles count from the perpendicular on its line, which is ``distance`` long and meets it ``foot`` short of the segment's middle.
     """

@@ -34,11 +34,11 @@ COARSER = 1.5
 BLOCK = 2
 """Nodes of a block along each side, likewise; each takes its own part of the directions."""
 EXTENDED = np.deg2rad(12.0)
-"""Angle of an LED, seen from the middle of the pad, from which it is extended; others cast edges."""
+"""Angle from which an LED, seen from the pad's middle, is extended; others cast edges."""
 STEP = np.deg2rad(27.0)
 """Most of such an angle that a node takes in one step."""
 MARGIN = 4e-3
-"""Width [m] about a crop in which shadows count too, for the light that the coat casts on itself."""
+"""Width [m] about a crop whose shadows count too, by light from coat to coat."""
 
 
 _BINOMIAL = ((-1, 0.25), (0, 0.5), (1, 0.25))
@@ -47,7 +47,7 @@ _FILTER = {1: ((0, 0, 1.0),), BLOCK: tuple((a, b, wa * wb) for a, wa in _BINOMIA
 
 
 def angle(led: LedSpec) -> float:
-    """Angle [rad] that the longer edge of ``led`` spans, seen across it from the middle of the pad."""
+    """Angle [rad] that the longer edge of ``led`` spans at most, seen from the pad's middle."""
     return 2 * float(np.arctan2(max(led.size) / 2, np.linalg.norm(led.position)))
 
 
