@@ -23,6 +23,10 @@ TILE = 0.5e-3
 Bounds on z hold two: a camera ray of slope t may be that over t off its tile's height, 2.8 mm for the Mini's steepest ray."""
 LOOK_UP_Z = -1.0e-3
 """Height at which a camera ray looks up its tile [m]: between rest and a deep press."""
+_BULGE = 0.2
+"""Height of a bulge over the gel's thickness up to which what is in view is known."""
+_RAYS = 33
+"""Camera rays along a side of the image that tell which nodes are in view."""
 
 
 def bilinear(corners: Sequence[Any], wx: Any, wy: Any) -> Any:
@@ -61,6 +65,21 @@ class NodeGrid:
         zx = (dr.gather(mi.Float, z, x_plus) - dr.gather(mi.Float, z, x_minus)) / (mi.Float(x_plus - x_minus) * self.dx)
         rise = dr.gather(mi.Float, z, y_plus) - dr.gather(mi.Float, z, y_minus)
         return zx, rise / (mi.Float((y_plus - y_minus) // nx) * self.dy)
+
+
+def nodes_in_view(g: NodeGrid, camera: Pinhole, thickness: float) -> tuple[int, int, int, int]:
+    """First column, first row, columns, rows of nodes in view of gel as thick [m] at most."""
+    left, top, width, height = camera.piece
+    u, v = np.meshgrid(np.linspace(left, left + width, _RAYS), np.linspace(top, top + height, _RAYS))
+    origin, slope = camera.ray(u, v)
+    z = thickness * np.array([-1.0, _BULGE])[:, None, None] - origin[2]
+    spans = []
+    for k, (first, step, count) in enumerate(((g.x0, g.dx, g.nx), (g.y0, g.dy, g.ny))):
+        seen = (origin[k] + z * slope[k] - first) / step
+        start = int(np.clip(np.floor(seen.min()) - 1, 0, count - 2))
+        stop = int(np.clip(np.ceil(seen.max()) + 2, start + 2, count))
+        spans.append((start, stop - start))
+    return spans[0][0], spans[1][0], spans[0][1], spans[1][1]
 
 
 @dataclass(frozen=True)

@@ -141,7 +141,7 @@ def test_indirect_light_is_that_of_all_patches_and_channels(monkeypatch: pytest.
         return build(mi, layout, case, camera, thickness, range(9))
 
     build = BounceField.build
-    monkeypatch.setattr(interreflection, "patches_in_view", lambda g, *_: (0, 0, g.nx, g.ny))
+    monkeypatch.setattr(interreflection, "nodes_in_view", lambda g, *_: (0, 0, g.nx, g.ny))
     monkeypatch.setattr(BounceField, "build", classmethod(everything))
     every = config.build(SPEC, **options).render(shown)
     assert some.rgb is not None and some.layers is not None and every.layers is not None

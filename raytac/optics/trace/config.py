@@ -32,7 +32,7 @@ class RayTraced(OpticsConfig[Any]):
     bounce: bool = True
     """Inter-reflection in ``fast``."""
     led_points: int = 1
-    """``fast`` integrates each LED with this number of points squared."""
+    """``fast`` takes so many times the points along each edge of an LED that its angle asks for."""
     max_depth: int = -1
     """Sampled integrators: number of reflections; 1 is direct light only, −1 has no limit."""
     flat_field: np.ndarray | None = None

@@ -1,16 +1,17 @@
 """``FastTracer``: quadrature over the LEDs, smooth inter-reflection; nothing is random.
 
-For each pixel one camera ray meets the coat, and for each LED the rendering equation's direct term is summed over a small grid of
+For each pixel one camera ray meets the coat, and for each LED the rendering equation's direct term is summed over a few
 points on its rectangle (Kajiya 1986, eq. 1 restricted to one bounce; area form of Shirley, Wang and Zimmerman 1996):
 
-    L_o(p) = Σ_led Σ_k w_k · f(p, ω_k, ω_o) · V_k · I(θ_k) · cos θ_p / r_k²
+    L_o(p) = Σ_led V_led · Σ_k w_k · f(p, ω_k, ω_o) · I(θ_k) · cos θ_p / r_k²
 
-with the LED's intensity I(θ) = power · cosⁿ θ, the coat's reflectance f and visibility V. Everything runs in Dr.Jit, batched over
-environments: one thread a pixel, one code for LLVM and CUDA.
+with the LED's intensity I(θ) = power · cosⁿ θ, the coat's reflectance f and the share V of the LED that p sees (``ShadowGrid``).
+Everything runs in Dr.Jit, batched over environments: one thread a pixel, one code for LLVM and CUDA.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -23,14 +24,15 @@ from raytac.optics.base import casts_shadows
 from raytac.optics.device_mode import DeviceFrame, Float, FrameInputs, UInt8
 from raytac.optics.geometry import CoatField, CoatLayout, PixelSample, see
 from raytac.optics.ink import ink_at, inked_albedo
-from raytac.optics.refraction import Slab
 from raytac.optics.response import mid_grey_exposure
 from raytac.optics.trace.config import RayTraced
+from raytac.optics.trace.direct import direct_light, quadrature
 from raytac.optics.trace.interreflection import BounceField, CaseLight
 from raytac.optics.trace.led import Lamp
 from raytac.optics.trace.scene import SensorScene
+from raytac.optics.trace.shadow import ShadowGrid
 from raytac.optics.trace.tracer import Tracer, total
-from raytac.specs.sensor import AUTO, CoatSpec, SensorSpec
+from raytac.specs.sensor import AUTO, LedSpec, SensorSpec
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,8 @@ class FastArrays:
     lamps: list[Lamp]
     bounce: BounceField | None
     """Grid of indirect light; None without inter-reflection."""
+    shadow: ShadowGrid | None
+    """Grid of the LEDs' visible shares; None without cast shadows."""
     scale: list[Float]
     """The response's gain by channel."""
 
@@ -67,9 +71,14 @@ class FastTracer(Tracer):
             scene = SensorScene(mi, self.sensor, grid)
             case = CaseLight.fit(scene, self._scene_lamps, self.groups, self.seed)
             bounce = BounceField.build(mi, self.layout, case, self.camera, self.sensor.gelpad.thickness, self._lit_channels)
-        self._arrays = FastArrays(lamps, bounce, [])
+        shadow = self._shadow_grid(self.layout) if self._lit and self.shadows else None
+        self._arrays = FastArrays(lamps, bounce, shadow, [])
         self._set_flat_field(grid)
         return replace(self._arrays, scale=self.response.device_scale(mi, self.camera))
+
+    def _shadow_grid(self, layout: CoatLayout) -> ShadowGrid:
+        thickness, leds = self.sensor.gelpad.thickness, self.sensor.lights.leds
+        return ShadowGrid.build(layout, self.camera, thickness, leds, self.config.led_points)
 
     @property
     def _lit_channels(self) -> list[int]:
@@ -82,9 +91,11 @@ class FastTracer(Tracer):
         layout, channels = CoatLayout.from_grid(grid), 3 * len(self.layer_names)
         # A pixel's levels before and after they are interleaved, and in bytes; a channel each.
         pixel = 27 * ("rgb" in self.outputs) + 4 * channels * ("layers" in self.outputs)
-        indirect = 0
+        indirect = 0  # fields on grids of their own
         if self.config.bounce:
             indirect = BounceField.memory_per_env(layout, self.camera, self.sensor.gelpad.thickness, self._lit_channels)
+        if self.shadows:
+            indirect += self._shadow_grid(layout).memory_per_env
         field = 8 * grid.rest.size + CoatField.memory_per_env(layout)  # height and ink
         return self._lit * (field + indirect + width * height * pixel)
 
@@ -113,28 +124,38 @@ class FastTracer(Tracer):
         mi, layout = self.mi, self.layout
         envs = dr.width(heights) // (layout.nx * layout.ny)
         field = CoatField(mi, layout, inputs.rest, heights)
-        bounce, radiosity = inputs.own.bounce, partial(self._radiosity, field, inputs)
+        bounce, shadow = inputs.own.bounce, inputs.own.shadow
+        shares = None if shadow is None else shadow.shares(mi, field, inputs.own.lamps, envs, self.slab)
+        radiosity = partial(self._radiosity, shares, inputs)
         grids = None if bounce is None else bounce.gather_light(mi, field, radiosity, envs)
         sums: list[Any] = []
         for a in range(self.config.rays):
             for b in range(self.config.rays):
                 seen = see(mi, field, self.camera, envs, ((a + 0.5) / self.config.rays, (b + 0.5) / self.config.rays))
-                channels = self._shade(field, seen, grids, inputs)
+                channels = self._shade(seen, shares, grids, inputs)
                 sums = [t + c for t, c in zip(sums, channels, strict=True)] if sums else channels
         return [t / self.config.rays**2 for t in sums]
 
-    def _shade(self, field: CoatField, seen: PixelSample, grids: list[Any] | None, inputs: FrameInputs) -> list[Any]:
+    def _shade(self, seen: PixelSample, shares: list[Any] | None, grids: list[Any] | None, inputs: FrameInputs) -> list[Any]:
         mi, coat = self.mi, self.sensor.coat
         diffuse_albedo = [(1 - coat.specular) * r for r in self._albedo(seen, inputs)]
         out = [mi.Float(0) for _ in range(3 * len(self.layer_names))]
-        for lamp, group in zip(inputs.own.lamps, self.groups, strict=True):
-            diffuse, specular = direct_light(mi, field, coat, seen, lamp, self.config.led_points, self.shadows, slab=self.slab)
+        for lamp, spec, group, share in self._sources(inputs, shares, seen):
+            diffuse, specular = direct_light(mi, coat, seen, lamp, quadrature(spec, self.config.led_points), slab=self.slab)
             for c in range(3):
-                out[3 * group + c] += lamp.power[c] * (diffuse * (diffuse_albedo[c] / dr.pi) + specular * coat.specular)
+                out[3 * group + c] += share * lamp.power[c] * (diffuse * (diffuse_albedo[c] / dr.pi) + specular * coat.specular)
         if grids is not None and inputs.own.bounce is not None:
             for k, e in inputs.own.bounce.irradiance(mi, grids, seen):
                 out[k] += e * ((diffuse_albedo[k % 3] + coat.specular) / dr.pi)
         return out if seen.exit is None else [o * seen.exit for o in out]
+
+    def _sources(
+        self, inputs: FrameInputs, shares: list[Any] | None, seen: PixelSample
+    ) -> Iterator[tuple[Lamp, LedSpec, int, Any]]:
+        """Lamp, LED, layer and visible share at ``seen`` of every LED."""
+        leds, shadow = self.sensor.lights.leds, inputs.own.shadow
+        visible = [1.0] * len(leds) if shadow is None else shadow.at(self.mi, shares, seen)
+        return zip(inputs.own.lamps, leds, self.groups, visible, strict=True)
 
     def _albedo(self, seen: PixelSample, inputs: FrameInputs) -> list[Any]:
         """Diffuse albedo of the coat or its dots at the seen points, a channel each."""
@@ -142,14 +163,14 @@ class FastTracer(Tracer):
             return list(self.sensor.coat.reflectance)
         return inked_albedo(self.sensor, ink_at(self.mi, self.layout, inputs.ink, seen.env, seen.p.x, seen.p.y))
 
-    def _radiosity(self, field: CoatField, inputs: FrameInputs, seen: PixelSample) -> list[Any]:
+    def _radiosity(self, shares: list[Any] | None, inputs: FrameInputs, seen: PixelSample) -> list[Any]:
         """Direct radiosity B of the coat at a sample, by channel, for its own inter-reflection."""
         mi, coat, albedo = self.mi, self.sensor.coat, self._albedo(seen, inputs)
         out = [mi.Float(0) for _ in range(3 * len(self.layer_names))]
-        for lamp, group in zip(inputs.own.lamps, self.groups, strict=True):
-            diffuse, _ = direct_light(mi, field, coat, seen, lamp, 1, self.shadows, specular=False, slab=self.slab)
+        for lamp, spec, group, share in self._sources(inputs, shares, seen):
+            diffuse, _ = direct_light(mi, coat, seen, lamp, quadrature(spec), specular=False, slab=self.slab)
             for c in range(3):
-                out[3 * group + c] += lamp.power[c] * diffuse * ((1 - coat.specular) * albedo[c] + coat.specular)
+                out[3 * group + c] += share * lamp.power[c] * diffuse * ((1 - coat.specular) * albedo[c] + coat.specular)
         return out
 
 
@@ -166,65 +187,3 @@ def with_exposure(sensor: SensorSpec, device: str = "auto") -> SensorSpec:
     rest = GelSurface.at_rest(make_grid(sensor.gelpad, grid_pitch(sensor.camera.pitch_at(sensor.camera.resolution))))
     exposure = mid_grey_exposure(sensor, total(tracer.render_layers(rest))[0] * tracer.response.scale)
     return replace(sensor, response=replace(sensor.response, exposure=exposure))
-
-
-def direct_light(
-    mi: Any,
-    field: CoatField,
-    coat: CoatSpec,
-    seen: PixelSample,
-    lamp: Lamp,
-    points: int,
-    shadows: bool,
-    specular: bool = True,
-    slab: Slab | None = None,
-) -> tuple[Any, Any]:
-    """(diffuse, specular) transport of one LED to every pixel, by power and reflectance.
-
-    ``points`` × ``points`` quadrature nodes (midpoint rule) over the LED's rectangle, one shadow ray each; through the face of
-    ``slab`` if there is one. Radiance is that at the coat.
-    """
-    diffuse, mirror = mi.Float(0), mi.Float(0)
-    for a in range(points):
-        for b in range(points):
-            light = lamp.sample(mi.Point2f((a + 0.5) / points, (b + 0.5) / points))
-            # An LED's extent e across the ray, seen from p, is the tangent e · turn / flat of elevation.
-            if slab is None:
-                d = light - seen.p
-                r2 = dr.squared_norm(d)
-                w = d * dr.rsqrt(r2)
-                out, target, spread = -w, light, r2
-                turn, flat = dr.sqrt(r2), dr.maximum(dr.squared_norm(d.xy), 1e-12)
-            else:
-                link, turn = slab.connect(mi, seen.p, light)
-                w, out, target, spread = link.w, link.out, link.via, 1 / link.gain
-                flat = dr.maximum(dr.squared_norm(w.xy), 1e-6)
-            cos_p = dr.dot(seen.n, w)
-            lobe = lamp.lobe_gain(out)
-            lit = (lobe > 0) & (cos_p > 0)
-            gain = dr.select(lit, lobe * cos_p / spread, 0) / points**2
-            if shadows:
-                up = mi.Vector3f(-out.x * out.z, -out.y * out.z, 1 - out.z * out.z) * dr.rsqrt(
-                    dr.maximum(1 - out.z * out.z, 1e-12)
-                )
-                tan_half = dr.maximum(lamp.extent(up) / points * turn / flat, 1e-4)
-                gain *= field.visibility(seen.env, seen.p, target, tan_half, lit)
-            diffuse += gain
-            if specular and coat.specular > 0:
-                mirror += gain * ggx(coat.roughness, seen.n, w, seen.wo)
-    return diffuse, mirror
-
-
-def ggx(alpha: float, n: Any, wi: Any, wo: Any) -> Any:
-    """GGX reflectance D G / (4 cos θ_i cos θ_o) of a mirror (Walter et al. 2007, eq. 20, 33)."""
-    h = dr.normalize(wi + wo)
-    ci, co, ch = dr.dot(n, wi), dr.dot(n, wo), dr.dot(n, h)
-    a2 = alpha * alpha
-    t = ch * ch * (a2 - 1) + 1
-    d = a2 / (dr.pi * t * t)
-
-    def g1(c: Any) -> Any:
-        return 2 / (1 + dr.sqrt(1 + a2 * (1 / (c * c) - 1)))
-
-    ok = (ci > 1e-4) & (co > 1e-4)
-    return dr.select(ok, d * g1(ci) * g1(co) / (4 * dr.maximum(ci, 1e-4) * dr.maximum(co, 1e-4)), 0)

@@ -23,7 +23,7 @@ import drjit as dr
 import numpy as np
 
 from raytac.optics.camera import Pinhole
-from raytac.optics.geometry import CoatField, CoatLayout, NodeGrid, PixelSample, bilinear
+from raytac.optics.geometry import CoatField, CoatLayout, NodeGrid, PixelSample, bilinear, nodes_in_view
 from raytac.optics.trace.led import Lamp
 from raytac.optics.trace.reference import OFFSET, connect, trace
 from raytac.optics.trace.scene import UNIT, SensorScene
@@ -38,10 +38,6 @@ REACH = 7
 """Radius of the neighbourhood that lights a patch [patches]."""
 TILT = 1.2
 """Largest tangent of a normal's tilt in the fit."""
-_BULGE = 0.2
-"""Height of a bulge over the gel's thickness up to which what is in view is known."""
-_RAYS = 33
-"""Camera rays along a side of the image that tell which patches are in view."""
 
 
 def _monomials(u: Any, v: Any) -> list[Any]:
@@ -104,21 +100,6 @@ def patches_of(layout: CoatLayout) -> NodeGrid:
     return NodeGrid(nx, ny, layout.x0, layout.y0, dx, dy)
 
 
-def patches_in_view(g: NodeGrid, camera: Pinhole, thickness: float) -> tuple[int, int, int, int]:
-    """First column, first row, columns, rows of patches in view of gel as thick [m] at most."""
-    left, top, width, height = camera.piece
-    u, v = np.meshgrid(np.linspace(left, left + width, _RAYS), np.linspace(top, top + height, _RAYS))
-    origin, slope = camera.ray(u, v)
-    z = thickness * np.array([-1.0, _BULGE])[:, None, None] - origin[2]
-    spans = []
-    for k, (first, step, count) in enumerate(((g.x0, g.dx, g.nx), (g.y0, g.dy, g.ny))):
-        seen = (origin[k] + z * slope[k] - first) / step
-        start = int(np.clip(np.floor(seen.min()) - 1, 0, count - 2))
-        stop = int(np.clip(np.ceil(seen.max()) + 2, start + 2, count))
-        spans.append((start, stop - start))
-    return spans[0][0], spans[1][0], spans[0][1], spans[1][1]
-
-
 @dataclass(frozen=True)
 class BounceField:
     """E(n) = max(0, e + n · v) of all indirect light on a coarse grid over the pad, by frame.
@@ -143,13 +124,13 @@ class BounceField:
         g = patches_of(layout)
         x, y = np.meshgrid(g.x0 + g.dx * np.arange(g.nx), g.y0 + g.dy * np.arange(g.ny))
         on_nodes = case.on(x.ravel(), y.ravel())
-        return cls(g, patches_in_view(g, camera, thickness), tuple(lit), [mi.Float(on_nodes[k].ravel()) for k in lit])
+        return cls(g, nodes_in_view(g, camera, thickness), tuple(lit), [mi.Float(on_nodes[k].ravel()) for k in lit])
 
     @staticmethod
     def memory_per_env(layout: CoatLayout, camera: Pinhole, thickness: float, lit: Sequence[int]) -> int:
         """Bytes of the grid while it is filled: results, patches, their light and heights."""
         g = patches_of(layout)
-        _, _, columns, rows = patches_in_view(g, camera, thickness)
+        _, _, columns, rows = nodes_in_view(g, camera, thickness)
         return 16 * len(lit) * columns * rows + g.nx * g.ny * (16 + 16 * -(-len(lit) // 4) + 4)
 
     def gather_light(self, mi: Any, field: CoatField, radiosity: Callable[[PixelSample], list[Any]], envs: Any) -> list[Any]:

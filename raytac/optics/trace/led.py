@@ -32,6 +32,26 @@ def lobe_slopes(cos_theta: np.ndarray, exponent: float, least: float) -> tuple[n
 
 
 @dataclass(frozen=True)
+class Sight:
+    """A segment of half length ``half`` that spans ``span`` [rad] from ``start``, seen from p.
+
+    Angles count from the perpendicular on its line, which is ``distance`` long and meets it ``foot`` short of the segment's middle.
+    """
+
+    half: Any
+    foot: Any
+    distance: Any
+    start: Any
+    span: Any
+
+    def at(self, share: Any) -> tuple[Any, Any]:
+        """Place u in [−1, 1] at ``share`` in [0, 1] of the angle, and length over 2 half by share."""
+        tangent = dr.tan(self.start + share * self.span)
+        u = dr.clip((self.distance * tangent - self.foot) / self.half, -1, 1)
+        return u, 0.5 * self.span * self.distance * (1 + tangent * tangent) / self.half
+
+
+@dataclass(frozen=True)
 class Lamp:
     """Dr.Jit arrays of one LED, and the even radiance of the case that goes with it.
 
@@ -42,6 +62,7 @@ class Lamp:
     centre: Any
     axis: Any
     half_u: Any
+    """Half of the edge that is longer as the pad's camera sees it, by its extent in x and y."""
     half_v: Any
     lobe: Any
     power: Any
@@ -50,12 +71,14 @@ class Lamp:
     @classmethod
     def from_spec(cls, mi: Any, led: LedSpec, unit: float = 1.0) -> Lamp:
         """The LED in ``unit`` length units per metre; power grows with unit², so that I / r² stays."""
-        u, v = np.array(led.edges)
+        halves = [0.5 * unit * length * edge for length, edge in zip(led.size, np.array(led.edges), strict=True)]
+        if np.hypot(*halves[1][:2]) > np.hypot(*halves[0][:2]):
+            halves.reverse()
         lamp = cls(
             centre=mi.Point3f([unit * c for c in led.position]),
             axis=mi.Vector3f(*led.axis),
-            half_u=mi.Vector3f((0.5 * unit * led.size[0] * u).tolist()),
-            half_v=mi.Vector3f((0.5 * unit * led.size[1] * v).tolist()),
+            half_u=mi.Vector3f(halves[0].tolist()),
+            half_v=mi.Vector3f(halves[1].tolist()),
             lobe=mi.Float(led.lobe),
             power=mi.Color3f([unit**2 * p for p in led.power]),
             glow=mi.Color3f([led.glow * p for p in led.power]) if led.glow else None,
@@ -66,16 +89,25 @@ class Lamp:
 
     def sample(self, square: Any) -> Any:
         """Point on the rectangle for ``square`` in [0, 1)²."""
-        return self.centre + (2 * square.x - 1) * self.half_u + (2 * square.y - 1) * self.half_v
+        return self.point(2 * square.x - 1, 2 * square.y - 1)
+
+    def point(self, u: Any, v: Any) -> Any:
+        """Point on the rectangle for ``u`` and ``v`` in [−1, 1]."""
+        return self.centre + u * self.half_u + v * self.half_v
+
+    def sight(self, mi: Any, p: Any) -> Sight:
+        """The longer edge's middle line as ``p`` sees it."""
+        half = dr.norm(self.half_u)
+        along, q = self.half_u / half, self.centre - p
+        foot = dr.dot(q, along)
+        distance = dr.maximum(dr.norm(q - foot * along), 1e-6)
+        start = dr.atan2(foot - half, distance)
+        return Sight(half, foot, distance, start, dr.atan2(foot + half, distance) - start)
 
     def lobe_gain(self, direction: Any) -> Any:
         """cosⁿ θ for light leaving along the unit ``direction``; 0 behind."""
         cos_theta = dr.dot(direction, self.axis)
         return dr.select(cos_theta > 0, lobe_gain(dr, cos_theta, self.lobe), 0)
-
-    def extent(self, direction: Any) -> Any:
-        """Half the rectangle's length [m] along the unit ``direction``."""
-        return dr.abs(dr.dot(direction, self.half_u)) + dr.abs(dr.dot(direction, self.half_v))
 
 
 _PICKED = ("centre", "axis", "half_u", "half_v", "lobe", "power")

@@ -1,0 +1,119 @@
+"""Direct light of one LED at the coat: quadrature over its rectangle, without cast shadows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from raytac.optics.geometry import PixelSample
+from raytac.optics.refraction import Slab
+from raytac.optics.trace.led import Lamp
+from raytac.specs.sensor import CoatSpec, LedSpec
+
+SMALL = np.deg2rad(25.0)
+"""Angle up to which an LED's edge is one point of the quadrature."""
+STEP = np.deg2rad(70.0)
+"""Angle of an LED's edge that a further point covers."""
+
+
+def quadrature(led: LedSpec, refinement: int = 1) -> tuple[int, int]:
+    """Number of points over the longer and the shorter edge of ``led``, by their angles.
+
+    The angles are those seen from the place of the gel plane over the LED. ``refinement`` multiplies both numbers.
+    """
+    distance = max(abs(led.position[2]), 1e-6)
+    angles = [2 * float(np.arctan(edge / 2 / distance)) for edge in sorted(led.size, reverse=True)]
+    along, across = (refinement * (1 if angle <= SMALL else 1 + int(np.ceil(angle / STEP))) for angle in angles)
+    return along, across
+
+
+def gauss(count: int) -> list[tuple[float, float]]:
+    """Places and weights of the Gauss-Legendre rule of ``count`` points on [0, 1]."""
+    places, weights = np.polynomial.legendre.leggauss(count)
+    return [(0.5 + 0.5 * float(x), 0.5 * float(w)) for x, w in zip(places, weights, strict=True)]
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """Light of one point of an LED at points of the coat; all Dr.Jit arrays."""
+
+    w: Any
+    """Unit direction from where it comes."""
+    gain: Any
+    """cosⁿ θ_led cos θ / r² of it [1/m²], refracted if there is a slab; 0 behind either surface."""
+    target: Any
+    """End of its last straight stretch: the LED's point, or that of the slab's face."""
+    up: Any
+    """Unit direction at the LED across the ray, in the vertical plane."""
+    turn: Any
+    """Tangent of elevation at the coat over extent along ``up`` [1/m]."""
+
+
+def arrival(mi: Any, seen: PixelSample, lamp: Lamp, light: Any, slab: Slab | None) -> Arrival:
+    """Light of a point of ``lamp``, ``light`` [m], at ``seen``, through ``slab`` if any."""
+    if slab is None:
+        d = light - seen.p
+        r2 = dr.squared_norm(d)
+        w = d * dr.rsqrt(r2)
+        out, target, spread = -w, light, 1 / r2
+        turn = dr.sqrt(r2) / dr.maximum(dr.squared_norm(d.xy), 1e-12)
+    else:
+        link, turn = slab.connect(mi, seen.p, light)
+        w, out, target, spread = link.w, link.out, link.via, link.gain
+        turn = turn / dr.maximum(dr.squared_norm(w.xy), 1e-6)
+    cosine, lobe = dr.dot(seen.n, w), lamp.lobe_gain(out)
+    gain = dr.select((lobe > 0) & (cosine > 0), lobe * cosine * spread, 0)
+    up = mi.Vector3f(-out.x * out.z, -out.y * out.z, 1 - out.z * out.z)
+    return Arrival(w, gain, target, up * dr.rsqrt(dr.maximum(1 - out.z * out.z, 1e-12)), turn)
+
+
+def direct_light(
+    mi: Any,
+    coat: CoatSpec,
+    seen: PixelSample,
+    lamp: Lamp,
+    points: tuple[int, int],
+    specular: bool = True,
+    slab: Slab | None = None,
+) -> tuple[Any, Any]:
+    """(diffuse, specular) transport of one LED to every pixel, by power and reflectance.
+
+    ``points``: nodes of Gauss-Legendre rules, over the angle that the longer edge spans and over the shorter edge (``Lamp.sight``). One
+    point is the LED's middle. Radiance is that at the coat, without cast shadows.
+    """
+    diffuse, mirror = mi.Float(0), mi.Float(0)
+    for u, weight in _along(mi, lamp, seen, points[0]):
+        for place, share in gauss(points[1]):
+            light = arrival(mi, seen, lamp, lamp.point(u, 2 * place - 1), slab)
+            gain = light.gain * weight * share
+            diffuse += gain
+            if specular and coat.specular > 0:
+                mirror += gain * ggx(coat.roughness, seen.n, light.w, seen.wo)
+    return diffuse, mirror
+
+
+def _along(mi: Any, lamp: Lamp, seen: PixelSample, points: int) -> Sequence[tuple[Any, Any]]:
+    """Places in [−1, 1] on the longer edge, and their weights."""
+    if points == 1:
+        return [(0.0, 1.0)]
+    sight = lamp.sight(mi, seen.p)
+    return [(u, weight * density) for place, weight in gauss(points) for u, density in (sight.at(place),)]
+
+
+def ggx(alpha: float, n: Any, wi: Any, wo: Any) -> Any:
+    """GGX reflectance D G / (4 cos θ_i cos θ_o) of a mirror (Walter et al. 2007, eq. 20, 33)."""
+    h = dr.normalize(wi + wo)
+    ci, co, ch = dr.dot(n, wi), dr.dot(n, wo), dr.dot(n, h)
+    a2 = alpha * alpha
+    t = ch * ch * (a2 - 1) + 1
+    d = a2 / (dr.pi * t * t)
+
+    def g1(c: Any) -> Any:
+        return 2 / (1 + dr.sqrt(1 + a2 * (1 / (c * c) - 1)))
+
+    ok = (ci > 1e-4) & (co > 1e-4)
+    return dr.select(ok, d * g1(ci) * g1(co) / (4 * dr.maximum(ci, 1e-4) * dr.maximum(co, 1e-4)), 0)
