@@ -64,6 +64,7 @@ class SolverBodies:
     """Bodies that the solver moves, S an environment; see ``SolverBody``."""
 
     mass: wp.array2d(dtype=wp.float64)
+    """[kg]; 0 of one that is not there."""
     inertia: wp.array2d(dtype=wp.mat33d)
     centre: wp.array2d(dtype=wp.vec3d)
     velocity: wp.array2d(dtype=wp.vec3d)
@@ -164,6 +165,19 @@ def begin_interval(
         interval.anchor[env, k, 0] = wp.transpose(turn) * (at - place_of(robot, bodies, interval, env, first))
         interval.anchor[env, k, 1] = wp.transpose(turn2) * (at - place_of(robot, bodies, interval, env, other))
         interval.rotation[env, k] = wp.transpose(turn2) * turn
+
+
+@wp.kernel
+def clear_interval(chosen: wp.array(dtype=wp.int32), contacts: Contacts, interval: Interval):
+    """No contacts and no forces in the environments ``chosen`` (B,)."""
+    env = wp.tid()
+    if chosen[env] == 0:
+        return
+    contacts.count[env] = 0
+    for body in range(interval.wrench.shape[1]):
+        for i in range(6):
+            interval.wrench[env, body, i] = _0
+            interval.applied[env, body, i] = _0
 
 
 @wp.func
@@ -308,7 +322,9 @@ def sign_of(contacts: Contacts, env: wp.int32, k: wp.int32, side: wp.int32) -> w
 
 
 @wp.func
-def find_mobility(robot: Robot, contacts: Contacts, bodies: SolverBodies, work: Work, env: wp.int32, rows: wp.int32):
+def find_mobility(
+    robot: Robot, contacts: Contacts, bodies: SolverBodies, interval: Interval, work: Work, env: wp.int32, rows: wp.int32
+):
     """A = J M⁻¹ Jᵀ of the robot and of the solver's bodies."""
     n = robot.speed.shape[1]
     for i in range(rows):
@@ -320,14 +336,16 @@ def find_mobility(robot: Robot, contacts: Contacts, bodies: SolverBodies, work: 
                 total += work.jacobian[env, i, d] * work.solved[env, j, d]
             work.mobility[env, i, j] = total
     for s in range(bodies.mass.shape[1]):
+        if bodies.mass[env, s] == _0:
+            continue
         light, quick = _1 / bodies.mass[env, s], wp.inverse(bodies.inertia[env, s])
         for k in range(contacts.count[env]):
             sign = sign_of(contacts, env, k, -2 - s)
             for m in range(contacts.count[env]):
                 both = sign * sign_of(contacts, env, m, -2 - s)
                 if both != _0:
-                    # Of a point at r: v = V − [r] Ω, so that a force f there gives f/m − [r] I⁻¹ [r']ᵀ … of the two arms.
-                    centre = bodies.centre[env, s]
+                    # A point at r from the centre has v − [r] ω, so that this is J M⁻¹ Jᵀ with J = (1, −[r]; 0, 1).
+                    centre = bodies.centre[env, s] + interval.shift[env, s]
                     r, q = cross_matrix(work.points[env, k] - centre), cross_matrix(work.points[env, m] - centre)
                     identity = wp.identity(n=3, dtype=wp.float64)
                     add_block(work, env, 6 * k, 6 * m, both, light * identity - r * quick * q)
@@ -344,20 +362,21 @@ def apply_law(
 ):  # fmt: skip
     """Add c to ``applied``, and move the solver's bodies by a step of h [s], in the environments ``chosen`` (B,)."""
     env = wp.tid()
-    count = contacts.count[env]
+    count = contacts.count[env] + 0
     if chosen[env] == 0 or count == 0:
         return
     rows, n = 6 * count, robot.speed.shape[1]
-    # Solver bodies of other arms: their centres have moved since the interval began.
     factorise(robot, work, env, n)
     place_contacts(robot, contacts, bodies, interval, work, env)
-    find_mobility(robot, contacts, bodies, work, env, rows)
+    find_mobility(robot, contacts, bodies, interval, work, env, rows)
     for i in range(rows):
         relative = wp.float64(0.0)
         for d in range(n):
             relative += work.jacobian[env, i, d] * (robot.speed[env, d] + h * robot.free[env, d])
         work.shift[env, i] = work.shift[env, i] + h * relative
     for s in range(bodies.mass.shape[1]):
+        if bodies.mass[env, s] == _0:
+            continue
         interval.velocity[env, s] = interval.velocity[env, s] + h / bodies.mass[env, s] * bodies.force[env, s]
         interval.spin[env, s] = interval.spin[env, s] + h * (wp.inverse(bodies.inertia[env, s]) * bodies.torque[env, s])
         for k in range(count):
@@ -397,7 +416,8 @@ def apply_law(
         force = wp.vec3d(work.c[env, 6 * k], work.c[env, 6 * k + 1], work.c[env, 6 * k + 2])
         torque = wp.vec3d(work.c[env, 6 * k + 3], work.c[env, 6 * k + 4], work.c[env, 6 * k + 5])
         for end in range(2):
-            side, sign = contacts.side[env, k, end], wp.where(end == 0, _1, -_1)
+            side = contacts.side[env, k, end] + 0
+            sign = wp.where(end == 0, _1, -_1)
             if side >= 0:
                 arm = work.points[env, k] - robot.centre[env, side]
                 add_wrench(interval.applied, env, side, sign * force, sign * (torque + wp.cross(arm, force)))
