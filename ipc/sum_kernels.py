@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, MatArray2d, VecArray2d
+from ipc.arrays import FloatArray, FloatArray2d, IntArray, MatArray2d, VecArray2d
 from ipc.contact.contacts import Contacts
 from ipc.contact.friction import Lagged, friction_slope_ratio, sliding
 

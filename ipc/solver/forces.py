@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from ipc.bodies.layout import Layout
-from ipc.report import ContactPairs, PairForces, RigidMotion, Wrench
+from ipc.report import ContactPairs, Wrench
 from ipc.solver.potential import Potential
 
 Floats = NDArray[np.float64]

@@ -28,13 +28,14 @@ from raytac.physics.soft.coat_points import CoatMarkers, CoatTraction
 from raytac.physics.soft.mesh import pad_mesh
 from raytac.physics.soft.scene import SoftScene
 from raytac.physics.soft.scene_state import SceneReport
-from raytac.robots.frames import body_poses, site_poses
-from raytac.se3 import pose_of, quaternion
+from raytac.robots.states import NumberWriter, StateReader, body_pose, site_pose
+from raytac.se3 import pose_of, quaternions
 from raytac.shapes.point_depth import SOLIDS, point_depth
 from raytac.shapes.triangulate import enclosed_volume, object_surface
 from raytac.specs.press import PADS
 from raytac.specs.task import PAIR_FRICTION, TaskScene
-from raytac.world.coupling import Coupling, coupling_inputs
+from raytac.world.c_coupling import CCoupling
+from raytac.world.coupling_inputs import CouplingInputs
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.forbidden_overlap import Inside, RobotOverlap
 from raytac.world.warp_frame import WarpFrame
@@ -46,6 +47,8 @@ _TOUCH = 1e-5
 _CELLS = 8
 """Cells of a soft body along its longest edge where the scene does not say."""
 
+_MOCAP = ("mocap_pos", 3), ("mocap_quat", 4)
+"""Members of a state that mirror a body of the solver, and their numbers for each."""
 _INSIDE = 1e-4
 """Most overlap of a body with a case or link that is not reported [m]: rounding."""
 
@@ -84,18 +87,24 @@ class SoftPads:
             ScenePad(mounted.name, spec, pad_mesh(spec.gelpad, level), correction=physics.correction)
             for mounted, spec in zip(composed.sensors, composed.sensor_specs, strict=True)
         ]
-        self._links = [int(self.model.body(m.body).id) for m in composed.sensors]
-        self._sites = [int(self.model.site(m.site).id) for m in composed.sensors]
+        links = [int(self.model.body(m.body).id) for m in composed.sensors]
+        sites = np.array([self.model.site(m.site).id for m in composed.sensors], int)
         self._own = [b for b in composed.touched if b.mocap >= 0]
         """Bodies that belong to the solver."""
         self._driven = [b for b in composed.touched if b.is_free]
         """Bodies that belong to MuJoCo."""
+        members = {"pads": site_pose(sites)} | {body.name: body_pose(body.index) for body in self._driven}
+        self._reader = StateReader(self._datas, members)
+        self._mirrors = [
+            (body.name, *(NumberWriter(self._datas, member, size * body.mocap + np.arange(size)) for member, size in _MOCAP))
+            for body in self._own
+        ]
         bodies = [_solver_body(scene, i) for i in range(len(scene.bodies))]
         starts = {b.name: pose_of(b.position, b.quaternion) for b in scene.bodies}
         self.soft = SoftScene(
             pads,
             bodies,
-            self._pad_poses(datas),
+            self._pad_poses(),
             starts,
             dt=scene.soft_timestep,
             gravity=scene.gravity,
@@ -109,11 +118,12 @@ class SoftPads:
         self._refuse_inside(datas, range(len(datas)))
         self._coupling = None
         if coupling == "two_way":
-            felt = self._links + [b.index for b in self._driven]
-            self._felt = dict(zip([*(m.name for m in composed.sensors), *(b.name for b in self._driven)], felt, strict=True))
-            self._coupling = Coupling(self.model, felt, len(datas))
+            self._inputs = CouplingInputs(self.soft, [*(m.name for m in composed.sensors), *(b.name for b in self._driven)])
+            felt, room = [*links, *(b.index for b in self._driven)], (self._inputs.contacts, self._inputs.solver_bodies)
+            self._coupling = CCoupling(models, self._datas, felt, contacts=room[0], solver_bodies=room[1])
+            self._chosen = wp.zeros(len(datas), dtype=wp.int32, device="cpu")
             self._prepare_bonded()
-        self._last_cases = self._pad_poses(datas)
+        self._last_cases = self._pad_poses()
         self._last_driven = {b.name: np.stack([starts[b.name]] * len(datas)) for b in self._driven}
         self._traction: dict[str, CoatTraction] = {}
         self._markers: dict[str, CoatMarkers] = {}
@@ -131,7 +141,7 @@ class SoftPads:
         Raises ``OverlapError``: bodies overlap there; the solver has not changed then, what MuJoCo shows of its bodies has.
         """
         datas = self._datas
-        cases, chosen = self._pad_poses(datas), list(envs)
+        cases, chosen = self._pad_poses(), list(envs)
         begin = {b.name: pose_of(b.position, b.quaternion) for b in self._scene.bodies}
         starts = {name: np.repeat(at[None], len(datas), axis=0) for name, at in begin.items()}
         for name, at in (bodies or {}).items():
@@ -140,7 +150,7 @@ class SoftPads:
         if bodies is None:
             self.soft.reset(chosen)
         else:
-            self._show(datas, chosen, starts)
+            self._show(chosen, starts)
             self._refuse_inside(datas, chosen, only_rigid=True)  # soft ones are where they were, not where they will be
             self.soft.reset(chosen, np.where(kept[:, None, None, None], self._last_cases, cases), starts)
         for b in envs:
@@ -152,9 +162,9 @@ class SoftPads:
                 wrench[b] = 0.0
             for key, values in self.report.items():
                 values[b] = _REPORT.get(key, 0.0)
-            if self._coupling is not None:
-                self._coupling.reset(b, datas[b])
-            self._mirror(datas, [b])
+        if self._coupling is not None:
+            self._coupling.reset(chosen)
+        self._mirror(chosen)
 
     def advance(self, drive: Drive, failed: np.ndarray) -> None:
         """Take one control step of all environments; failures are marked in ``failed`` (B,).
@@ -169,17 +179,15 @@ class SoftPads:
         interval, since, reports = round(scene.soft_timestep / timestep), np.zeros(len(datas), int), []
         steps = round(scene.control_timestep / timestep)
         for step in range(1, steps + 1):
-            for b, data in enumerate(datas):
-                if not failed[b]:
-                    failed[b] = not self._ahead(data, b, drive)
+            self._ahead(drive, failed)
             since += 1
-            cases, driven = self._now(datas, failed)
+            cases, driven = self._now(failed)
             # Before a contact begins, the solver steps early, so that MuJoCo has the contact's force before the bodies overlap far.
             due = (since == interval) | (step == steps)
             if self._coupling is not None and not due.all():
                 due |= ~self.soft.is_small(cases, driven, since * timestep)
             if due.any():
-                reports.append(self._follow(datas, failed, cases, driven, since * timestep, due))
+                reports.append(self._follow(failed, cases, driven, since * timestep, due))
                 since[due] = 0
         whole = reduce(SceneReport.then, reports)
         failed |= ~whole.last_converged
@@ -244,7 +252,7 @@ class SoftPads:
         return []
 
     def _prepare_bonded(self) -> None:
-        """Invert the stiffness of bonded soft bodies now, for ``coupling_inputs`` at first touch."""
+        """Invert the stiffness of bonded soft bodies now, for ``CouplingInputs`` at first touch."""
         scene = self._scene
         for i, body in enumerate(scene.bodies):
             if body.held_by is None:
@@ -255,28 +263,31 @@ class SoftPads:
                 cell = None if body.cell is None else float(f"{body.cell * 1e3:.6g}")
                 raise SpecError(str(error), file=scene.source, key=f"body[{i}].cell_mm", value=cell) from error
 
-    def _ahead(self, data: mujoco.MjData, b: int, drive: Drive) -> bool:
-        """Take one step of MuJoCo; False if the state is no longer valid."""
-        mujoco.mj_step1(self._models[b], data)
-        drive([b])
+    def _ahead(self, drive: Drive, failed: np.ndarray) -> None:
+        """Take one step of MuJoCo in environments that have not failed (B,); marks new failures."""
+        models, datas, alive = self._models, self._datas, np.flatnonzero(~failed).tolist()
+        for b in alive:
+            mujoco.mj_step1(models[b], datas[b])
+        if alive:
+            drive(alive)
         if self._coupling is not None:
-            self._coupling.apply(data, b)
-        mujoco.mj_step2(self._models[b], data)
-        if lost([data])[0]:
-            return False
-        mujoco.mj_kinematics(self._models[b], data)
-        mujoco.mj_comPos(self._models[b], data)
-        return True
+            self._coupling.apply(alive)
+        for b in alive:
+            mujoco.mj_step2(models[b], datas[b])
+        if alive:
+            failed[alive] = lost([datas[b] for b in alive])
+        for b in np.flatnonzero(~failed).tolist():
+            mujoco.mj_kinematics(models[b], datas[b])
+            mujoco.mj_comPos(models[b], datas[b])
 
-    def _now(self, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    def _now(self, failed: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """MuJoCo's poses of cases and of its bodies; failed environments keep their last ones."""
-        cases = np.where(failed[:, None, None, None], self._last_cases, self._pad_poses(datas))
-        now = {body.name: body_poses(datas, body.index) for body in self._driven}
+        now = self._reader.values()
+        cases = np.where(failed[:, None, None, None], self._last_cases, now.pop("pads"))
         return cases, {name: np.where(failed[:, None, None], self._last_driven[name], pose) for name, pose in now.items()}
 
     def _follow(
         self,
-        datas: Sequence[mujoco.MjData],
         failed: np.ndarray,
         cases: np.ndarray,
         driven: dict[str, np.ndarray],
@@ -293,33 +304,33 @@ class SoftPads:
         for name, pose in driven.items():
             self._last_driven[name][due] = pose[due]
         failed |= report.failed
-        alive = np.flatnonzero(due & ~failed).tolist()
-        self._mirror(datas, alive)
+        self._mirror(np.flatnonzero(due & ~failed).tolist())
         if self._coupling is not None:
-            inputs = coupling_inputs(self.soft, self._felt)
-            for b in alive:
-                failed[b] = not np.isfinite(inputs[b][0]).all()
-                if not failed[b]:
-                    self._coupling.update(datas[b], b, *inputs[b])
+            wrenches = self.soft.world.sums.host
+            sound = np.isfinite(wrenches["force"]).all(axis=(1, 2)) & np.isfinite(wrenches["torque"]).all(axis=(1, 2))
+            failed |= due & ~sound
+            self._chosen.numpy()[:] = due & ~failed
+            self._inputs.gather(self._coupling.law, self._chosen)
+            self._coupling.update(np.flatnonzero(due & ~failed).tolist())
         for k, mounted in enumerate(self.composed.sensors):
             turn, world = cases[:, k, :3, :3], self.soft.wrench(mounted.name)
             split = [np.einsum("bji,bj->bi", turn, world[:, at : at + 3]) for at in (0, 3)]
             self._wrench[mounted.name][due] = np.concatenate(split, axis=1)[due]
         return report
 
-    def _mirror(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray) -> None:
+    def _mirror(self, envs: Sequence[int]) -> None:
         """Set the mocap bodies to the poses of the solver's bodies."""
-        self._show(datas, envs, {body.name: self.soft.pose(body.name) for body in self._own})
+        if self._own and envs:
+            self._show(envs, {body.name: self.soft.pose(body.name) for body in self._own})
 
-    def _show(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray, poses: Mapping[str, np.ndarray]) -> None:
-        for body in self._own:
-            at = poses[body.name]
-            for b in envs:
-                datas[b].mocap_pos[body.mocap] = at[b, :3, 3]
-                datas[b].mocap_quat[body.mocap] = quaternion(at[b, :3, :3])
+    def _show(self, envs: Sequence[int], poses: Mapping[str, np.ndarray]) -> None:
+        for name, place, turn in self._mirrors:
+            place.values[:], turn.values[:] = poses[name][:, :3, 3], quaternions(poses[name])
+            place.write(envs)
+            turn.write(envs)
         if self._own:
             for b in envs:
-                mujoco.mj_kinematics(self._models[b], datas[b])
+                mujoco.mj_kinematics(self._models[b], self._datas[b])
 
     def _inside(
         self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | range | np.ndarray, *, only_rigid: bool = False
@@ -353,9 +364,9 @@ class SoftPads:
                 )
         return depth
 
-    def _pad_poses(self, datas: Sequence[mujoco.MjData]) -> np.ndarray:
+    def _pad_poses(self) -> np.ndarray:
         """``world_from_pad`` of every environment and pad, (B, S, 4, 4)."""
-        return np.stack([site_poses(datas, site) for site in self._sites], axis=1)
+        return self._reader.values()["pads"]
 
 
 def _solver_body(scene: TaskScene, index: int) -> SceneBody:
