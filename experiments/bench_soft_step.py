@@ -60,8 +60,18 @@ def main(args: Args) -> dict[str, Metric]:
             raise InputError("against", value=args.against, rule="must be a checkout of this project")
         sides[f"_{commit(args.against.resolve())}"] = args.against.resolve()
     with recorded(args, "bench_soft_step", owned=("metrics.json",)) as (_, metrics):
-        metrics |= {"envs": args.envs, "steps": args.steps, "far": args.far, "rounds": args.rounds, "commit": commit(ours), **machine()}
-        pushes = {end: measured(side, push_figures, args.envs, args.approach, args.steps, args.device, args.seed) for end, side in sides.items()}
+        metrics |= {
+            "envs": args.envs,
+            "steps": args.steps,
+            "far": args.far,
+            "rounds": args.rounds,
+            "commit": commit(ours),
+            **machine(),
+        }
+        pushes = {
+            end: measured(side, push_figures, args.envs, args.approach, args.steps, args.device, args.seed)
+            for end, side in sides.items()
+        }
         for end, found in pushes.items():
             metrics |= {f"push.{key}{end}": value for key, value in found.items()}
             print(f"push{end}: {found['solves']:.3g} solves a control step", flush=True)

@@ -68,7 +68,7 @@ class PairSums:
 @wp.func
 def nearest_rotation(A: wp.mat33d) -> wp.mat33d:
     """The rotation nearest to A: U Vᵀ of its singular value decomposition."""
-    U, sigma, V = wp.svd3(A)
+    U, _sigma, V = wp.svd3(A)
     if wp.determinant(U) * wp.determinant(V) < wp.float64(0.0):
         for i in range(3):
             U[i, 2] = -U[i, 2]

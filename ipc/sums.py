@@ -71,7 +71,9 @@ class StepSums:
             kind = {2: wp.float64, 3: wp.vec3d, 4: wp.mat33d}[len(shape)]
             target = self._pairs if name.startswith("pair_") else self._bodies
             setattr(target, name.removeprefix("pair_"), wp.array(ptr=place, shape=shape[:2], dtype=kind, device=device))
-        self.mass = np.where(np.diff(layout.node_start) > 0, np.add.reduceat(np.append(_shares(layout), 0.0), layout.node_start[:-1]), 0.0)
+        self.mass = np.where(
+            np.diff(layout.node_start) > 0, np.add.reduceat(np.append(_shares(layout), 0.0), layout.node_start[:-1]), 0.0
+        )
         self.copies = 0
         self._host: dict[str, Floats] = {}
         self._fresh = False

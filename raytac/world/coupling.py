@@ -156,7 +156,9 @@ class Coupling:
 
     def update(self, chosen: wp.array) -> None:
         """Begin an interval of the environments ``chosen`` (B,), int32, at the poses of the state."""
-        self._launch(kernels.begin_interval, self.num_envs, [chosen, self._robot, self.contacts, self.solver_bodies, self._interval])
+        self._launch(
+            kernels.begin_interval, self.num_envs, [chosen, self._robot, self.contacts, self.solver_bodies, self._interval]
+        )
 
     def hold(self) -> None:
         """Write w₀ to ``applied``, at the poses of the state."""

@@ -93,7 +93,7 @@ def side_now(names: Names, patches: Patches, env: wp.int32, pair: wp.int32, end:
     """Side of a pair; ``NOTHING`` for a bonded body whose patch does not move."""
     side = names.side[pair, end] + 0
     free = names.free.shape[0]
-    if side <= -2 - free:
+    if side <= -2 - free:  # noqa: SIM102  (`and` evaluates both sides)
         if patches.touched[env, -2 - side - free] == 0:
             side = NOTHING
     return side

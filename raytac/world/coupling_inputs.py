@@ -121,7 +121,11 @@ class CouplingInputs:
                 patch = self._scene.world.held_patch(name, b)
                 fields["touched"][b, p] = patch is not None
                 if patch is not None:
-                    fields["mass"][b, p], fields["inertia"][b, p], fields["centre"][b, p] = patch.mass, patch.inertia, patch.centre
+                    fields["mass"][b, p], fields["inertia"][b, p], fields["centre"][b, p] = (
+                        patch.mass,
+                        patch.inertia,
+                        patch.centre,
+                    )
                     fields["velocity"][b, p], fields["spin"][b, p] = patch.velocity[:3], patch.velocity[3:]
                     fields["stiffness"][b, p] = STIFFENING * patch.stiffness
         for name, values in fields.items():

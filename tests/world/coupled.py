@@ -48,7 +48,10 @@ def set_interval(
     """Begin an interval of the only environment with these contacts and bodies of the solver."""
     law = coupling.law
     law.wrench.numpy()[0], law.contacts.count.numpy()[0] = wrench, len(contacts)
-    fields = {name: getattr(law.contacts, name).numpy()[0] for name in ("side", "stiffness", "place", "normal", "opens", "force", "torque")}
+    fields = {
+        name: getattr(law.contacts, name).numpy()[0]
+        for name in ("side", "stiffness", "place", "normal", "opens", "force", "torque")
+    }
     for k, one in enumerate(contacts):
         normal = np.zeros(3) if one.normal is None else one.normal
         share = np.append(normal, np.zeros(3)) if one.wrench is None else one.wrench

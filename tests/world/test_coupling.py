@@ -208,5 +208,5 @@ def test_what_cannot_be_coupled_is_named():
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     for bodies in ([0], [1, 1], [7]):
-        with pytest.raises(InputError, match="bodies = .*different bodies of the model"):
+        with pytest.raises(InputError, match=r"bodies = .*different bodies of the model"):
             CCoupling([model], [data], bodies, contacts=1)
