@@ -5,9 +5,9 @@
 
 ``push.solves``, ``.newton`` and ``.linear`` are what an environment of PushCube takes in a control step while a pad drags the cube over the
 table: calls of the solver, its Newton iterations and those of their conjugate gradients. ``far.ms_per_step`` is the median time of a
-control step of ``--far`` environments of a pad with nothing within half a metre, and ``far.solves`` the calls in it. With ``--against`` both
-checkouts are measured in processes of their own, ``--rounds`` times by turns; theirs have the commit's name at the end, and
-``far.speedup_vs_<name>`` is the median over rounds of the ratio of the times. They count alike: what a state's ``report`` says.
+control step of ``--far`` environments of a pad with nothing within half a metre, and ``far.solves`` the calls in it. With ``--against``
+both checkouts are measured in processes of their own, the times ``--rounds`` times by turns; theirs have the commit's name at the end,
+and ``far.speedup_vs_<name>`` is the median over rounds of the ratio of the times. They count alike: what a state's ``report`` says.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class Args(CommonOptions):
     """Checkout of another commit to take turns with."""
     envs: int = 1
     """Environments of PushCube."""
-    steps: int = 6
+    steps: int = 4
     """Control steps in which a cube is dragged that count."""
-    approach: int = 14
+    approach: int = 10
     """Control steps before these, in which the pad comes down on the cube and begins to drag it."""
     far: int = 4
     """Environments with nothing near."""
@@ -68,13 +68,6 @@ def main(args: Args) -> dict[str, Metric]:
             "commit": commit(ours),
             **machine(),
         }
-        pushes = {
-            end: measured(side, push_figures, args.envs, args.approach, args.steps, args.device, args.seed)
-            for end, side in sides.items()
-        }
-        for end, found in pushes.items():
-            metrics |= {f"push.{key}{end}": value for key, value in found.items()}
-            print(f"push{end}: {found['solves']:.3g} solves a control step", flush=True)
         rounds: dict[str, list[dict[str, float]]] = {end: [] for end in sides}
         for k in range(args.rounds):
             for end in list(sides) if k % 2 == 0 else list(sides)[::-1]:
@@ -86,6 +79,11 @@ def main(args: Args) -> dict[str, Metric]:
             ratios = [theirs["ms_per_step"] / own["ms_per_step"] for theirs, own in zip(rounds[end], rounds[""], strict=True)]
             metrics[f"far.speedup_vs{end}"] = float(np.median(ratios))
             metrics |= {f"far.speedup_least_vs{end}": min(ratios), f"far.speedup_most_vs{end}": max(ratios)}
+        for end, side in sides.items():
+            inputs = (args.envs, args.approach, args.steps, args.device, args.seed)
+            found = measured(side, push_figures, *inputs)
+            metrics |= {f"push.{key}{end}": value for key, value in found.items()}
+            print(f"push{end}: {found['solves']:.3g} solves a control step", flush=True)
     return metrics
 
 
