@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from raytac.world import coupling_kernels
 from raytac.world.c_coupling import CCoupling
 from tests.world.coupled import Contact, set_interval
 from tests.world.coupling_oracle import first_step
@@ -16,6 +17,9 @@ ARM = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
 <joint type="slide" axis="1 0 0"/><geom type="box" size=".01 .02 .01" pos="0 .01 0"/></body></body></body>
 <body name="ball" pos=".3 .1 .6"><freejoint/><geom type="ellipsoid" size=".02 .03 .01"/></body></worldbody></mujoco>"""
 NAMES = ("finger", "ball", "lower")
+FIELDS = {"contacts": coupling_kernels.Contacts.vars, "solver_bodies": coupling_kernels.SolverBodies.vars}
+MIDDLE = np.array([0.3, 0.0, 0.6])
+"""About where the contacts are [m]."""
 
 
 def moving(seed: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -36,7 +40,7 @@ def drawn(seed: int) -> tuple[np.ndarray, list[Contact], list[dict[str, np.ndarr
         wrench = rng.normal(0.0, 1.0, 6) * np.array([1.0] * 3 + [0.01] * 3)
         opens = (side, other) != (2, -3)
         normal = wrench[:3] + rng.normal(0.0, 0.1, 3) if opens else None
-        place = rng.normal(0.0, 0.05, 3) + [0.3, 0.0, 0.6]
+        place = rng.normal(0.0, 0.05, 3) + MIDDLE
         contacts.append(Contact(side, root.T @ root, place, other, normal, wrench if opens else None))
     partners = []
     for _ in range(2):
@@ -44,7 +48,7 @@ def drawn(seed: int) -> tuple[np.ndarray, list[Contact], list[dict[str, np.ndarr
         values = {"mass": np.array(rng.uniform(0.02, 0.3)), "inertia": root.T @ root + 1e-6 * np.eye(3)}
         for name, size in (("velocity", 0.2), ("spin", 2.0), ("force", 1.0), ("torque", 0.01)):
             values[name] = rng.normal(0.0, size, 3)
-        partners.append(values | {"centre": rng.normal(0.0, 0.02, 3) + [0.3, 0.0, 0.6]})
+        partners.append(values | {"centre": rng.normal(0.0, 0.02, 3) + MIDDLE})
     return rng.normal(0.0, 1.0, (3, 6)) * np.array([1.0] * 3 + [0.01] * 3), contacts, partners
 
 
@@ -80,7 +84,7 @@ def test_a_batch_is_its_environments_and_others_are_left_alone() -> None:
         singles.append((model, data, single))
         for group in ("contacts", "solver_bodies"):
             ours, theirs = getattr(batch.law, group), getattr(single.law, group)
-            for name in type(ours).vars if hasattr(type(ours), "vars") else ours._cls.vars:
+            for name in FIELDS[group]:
                 getattr(ours, name).numpy()[b] = getattr(theirs, name).numpy()[0]
         batch.law.wrench.numpy()[b] = single.law.wrench.numpy()[0]
     batch.update([0, 1, 2])

@@ -98,5 +98,5 @@ def test_what_soft_pads_on_mujoco_warp_cannot_do_is_refused() -> None:
     world = grip("mujoco", engine="mujoco_warp", device="cpu")
     with pytest.raises(InputError, match="must be constant in a step"):
         world.step(lambda data, time: None)
-    with pytest.raises(InputError, match="read world.state"):
+    with pytest.raises(InputError, match=r"read world\.state"):
         _ = world.data
