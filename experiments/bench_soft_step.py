@@ -110,7 +110,7 @@ def push_figures(envs: int, approach: int, steps: int, device: str, seed: int) -
     rows = []
     for k in range(approach + steps):
         force = -env.batch.world.state().wrench["sensor"][:, 2]
-        action = np.zeros((envs, env.single_action_space.shape[0]))
+        action = np.zeros((envs, env.single_action_space.shape[0]))  # type: ignore[index]
         action[:, 0] = np.where(force > 1.0, 0.5, 0.0)
         action[:, 2] = np.clip(0.3 * (force - 2.0), -1.0, 1.0)
         before = env.batch.world.state().world_from_body["cube"][:, :3, 3]

@@ -52,7 +52,7 @@ def main(args: Args) -> dict[str, Metric]:
             for physics in PHYSICS:
                 if any((row["policy"], row["physics"]) == (policy, physics) for row in rows):
                     continue
-                rows.append(played(policy, physics, args, device))
+                rows.append(played(policy, physics, args))
                 store(kept, settings, rows)
                 print(text_of(rows[-1]), flush=True)
         metrics |= {"episodes": args.episodes, "num_envs": args.num_envs, **machine()}
@@ -62,10 +62,16 @@ def main(args: Args) -> dict[str, Metric]:
     return metrics
 
 
-def played(policy: str, physics: str, args: Args, device: str) -> dict[str, Metric]:
+def played(policy: str, physics: str, args: Args) -> dict[str, Metric]:
     """Success of a policy on pads of one kind."""
     given = play.Args(
-        policy=policy, physics=physics, episodes=args.episodes, num_envs=args.num_envs, film=False, seed=args.seed, device=device
+        policy=policy,
+        physics=physics,
+        episodes=args.episodes,
+        num_envs=args.num_envs,
+        film=False,
+        seed=args.seed,
+        device=args.device,
     )
     if policy.startswith("scripted:"):
         given = replace(given, policy="scripted", task=policy.removeprefix("scripted:"))

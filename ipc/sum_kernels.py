@@ -2,6 +2,7 @@
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
 # pyright: reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false
+# pyright: reportReturnType=false
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class SumLayout:
-    """What the sums need of :class:`ipc.bodies.layout.Layout`.
+    """Parts of :class:`ipc.bodies.layout.Layout` that the sums need.
 
     ``corner`` (A, 3) is the place of each affine body's first corner in its own frame [m], ``gradient`` (A, 4) of ``vec3d`` those of its
     corners' weights [1/m], and ``affine`` (bodies,) the body's number among them, −1 for another. ``framed`` is 1 where a frame carries a

@@ -75,7 +75,7 @@ class StepSums:
             np.diff(layout.node_start) > 0, np.add.reduceat(np.append(_shares(layout), 0.0), layout.node_start[:-1]), 0.0
         )
         self.copies = 0
-        self._host: dict[str, Floats] = {}
+        self._host: dict[str, Any] = {}
         self._fresh = False
 
     def expire(self) -> None:
@@ -110,7 +110,7 @@ class StepSums:
 def _shares(layout: Layout) -> Floats:
     """Mass of each node [kg], (N,)."""
     rows = np.repeat(np.arange(len(layout.node_rest)), np.diff(layout.row_start))
-    return np.bincount(rows, weights=layout.mass, minlength=len(layout.node_rest))
+    return np.bincount(rows, weights=layout.mass, minlength=len(layout.node_rest)).astype(np.float64)
 
 
 def _sum_layout(layout: Layout, bodies: tuple[Body, ...], device: wp.Device) -> Any:

@@ -44,7 +44,7 @@ _VECTORS = {"place": "xpos", "centre": "xipos"}
 
 
 def coupling_numbers(model: mujoco.MjModel, bodies: Sequence[int]) -> dict[str, Numbers]:
-    """What ``Coupling`` reads of a state of MuJoCo, for a reader of many of them."""
+    """Numbers that ``Coupling`` needs of a state of MuJoCo, for a reader of many of them."""
     n, dofs = np.array(bodies, int), np.arange(model.nv)
     vectors = 3 * n[:, None] + np.arange(3)
     result = {name: numbers(member, vectors) for name, member in _VECTORS.items()}

@@ -39,7 +39,7 @@ class Sums:
 
 @wp.struct
 class Names:
-    """What the solver's bodies and pairs are in the coupling."""
+    """Roles of the solver's bodies and pairs in the coupling."""
 
     felt: wp.array(dtype=wp.int32)
     """Solver's number of each coupled body, (n,)."""

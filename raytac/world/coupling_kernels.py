@@ -75,7 +75,7 @@ class SolverBodies:
 
 @wp.struct
 class Interval:
-    """What an interval remembers of its beginning and of its bodies since."""
+    """Memory of an interval: its beginning, and its bodies since."""
 
     wrench: wp.array3d(dtype=wp.float64)
     """w₀ on each coupled body about its frame's origin, (B, n, 6)."""

@@ -41,8 +41,8 @@ class WarpSoftStates:
         if engine.launches is not None:
             raise InputError("launches", value=engine.launches, rule="must be None with soft pads, which divide steps themselves")
         self.composed, self._scratch = composed, mujoco.MjData(composed.model)
-        memory = {"contacts": engine.contacts, "rows": engine.rows}
-        self.world = WarpWorld(replace(composed, touched=()), num_envs=num_envs, device=device, **memory)
+        robot = replace(composed, touched=())
+        self.world = WarpWorld(robot, num_envs=num_envs, device=device, contacts=engine.contacts, rows=engine.rows)
         self.models = self.world.models
         self._sites = np.array([composed.model.site(m.site).id for m in composed.sensors], int)
         cases = np.repeat(site_poses([self.first()], self._sites), num_envs, axis=0)

@@ -53,7 +53,7 @@ def test_a_policy_pushes_the_cube_on_rigid_pads_and_a_run_goes_on(tmp_path: Path
     """Success needs the right network: 251 of 256 in docs/rl.md."""
     path = next(path for path in POLICIES if path.stem == "push_cube_ppo")
     args = soft_policies.Args(policies=str(path), episodes=4, num_envs=4, device="cpu", out=tmp_path)
-    row = soft_policies.played(str(path), "rigid", args, "cpu")
+    row = soft_policies.played(str(path), "rigid", args)
     assert row["task"] == "PushCube" and row["successes"] >= 3 and row["failed"] == 0  # type: ignore[operator]
     settings = {"episodes": 4, "num_envs": 4, "device": "cpu"}
     soft_policies.store(tmp_path / "rows.json", settings, [row, {**row, "physics": "ipc", "success": 0.25}])
