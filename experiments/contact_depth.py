@@ -14,14 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from experiments.running import recorded, run
-from raytac.calibrate.pressed_balls import contact_radius
+from raytac import quiet_warp
+from raytac.calibrate import contact_radius
 from raytac.device import resolve_device
 from raytac.gel import ElasticSurround, GelSurface
 from raytac.io import CommonOptions, parse_names
-from raytac.physics import RigidPad, SoftPad, quiet_solver
-from raytac.physics.press import PressPad
-from raytac.specs import PADS, load_sensor
-from raytac.specs.press import ObjectSpec, PressScene, StageSpec
+from raytac.physics import PressPad, RigidPad, SoftPad
+from raytac.specs import PADS, ObjectSpec, PressScene, StageSpec, load_sensor
 
 PITCH = 0.06e-3
 """Spacing of the nodes [m]."""
@@ -42,7 +41,7 @@ def main(args: Args) -> None:
     levels = parse_names(args.levels, "levels", PADS) if args.levels else ()
     depths, radius, sensor = [float(d) for d in args.depths_mm.split(",")], args.radius_mm / 1e3, load_sensor(args.sensor)
     device = resolve_device(args.device, ray_tracing=False)
-    quiet_solver()
+    quiet_warp()
     ball = ObjectSpec("sphere", {"radius": radius}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)
     scene = PressScene("ball", ball, (StageSpec("indent", depth=max(depths) / 1e3),))
     pads: dict[str, PressPad] = {"rigid": RigidPad(sensor, scene, pitch=PITCH)}

@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 
 from experiments.running import recorded, run
 from raytac.checks import check_whole
-from raytac.gel.gaussian import LAYER_STEPS, PYRAMID_SIGMAS
+from raytac.gel import LAYER_STEPS, PYRAMID_SIGMAS
 from raytac.io import CommonOptions
 from tests.gel.layer_contact import Layer, Overlap, ball, cone, cylinder, punch, slope_error
 

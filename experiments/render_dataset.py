@@ -17,11 +17,12 @@ from typing import Annotated
 import tyro
 
 from experiments.running import run
+from raytac import quiet_warp
 from raytac.dataset import ENGINES, DatasetPlan, PressDataset, RunReport, contact_sheet, render_dataset, verify_dataset
 from raytac.errors import InputError
 from raytac.io import CommonOptions, parse_names, parse_resolution, versions, write_metrics, write_png
 from raytac.optics import OPTICS
-from raytac.physics import PHYSICS, quiet_solver
+from raytac.physics import PHYSICS
 from raytac.report import machine
 from raytac.specs import SweepSpec, load_sweep
 
@@ -65,7 +66,7 @@ class Args(CommonOptions):
 def main(args: Args) -> RunReport | None:
     """Render, or verify, and write ``metrics.json`` beside the data set's own files."""
     start = time.perf_counter()
-    quiet_solver()
+    quiet_warp()
     out = args.out if args.out is not None else Path("runs") / "dataset"
     if args.verify:
         check = verify_dataset(out, progress=True)

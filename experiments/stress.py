@@ -27,12 +27,13 @@ from pathlib import Path
 import numpy as np
 
 from experiments.running import resumed, run, store
+from raytac import quiet_warp
 from raytac.device import resolve_device
 from raytac.errors import InputError, SpecError
 from raytac.frame import TactileFrame
 from raytac.gel import cell_areas
 from raytac.io import CommonOptions, FolderLock, Metric, parse_names, versions, write_metrics
-from raytac.physics import Ipc, SoftPad, quiet_solver
+from raytac.physics import Ipc, SoftPad
 from raytac.report import machine
 from raytac.sensor import TactileSensor
 from raytac.specs import PADS, ObjectSpec, PressScene, StageSpec, load_press, load_sensor, validate_press
@@ -81,7 +82,7 @@ def main(args: Args) -> dict[str, Metric]:
     out = args.out or Path("runs/stress")
     settings = {"seed": args.seed, "deepest": args.deepest, "pad": args.pad, "device": device}
     if "ipc" in names:
-        quiet_solver()
+        quiet_warp()
     with FolderLock(out):
         kept = {name: resumed(out / f"{name}.json", settings) for name in names}
         metrics: dict[str, Metric] = {"experiment": "stress", "device": device, "seed": args.seed, "pad": args.pad, **machine()}

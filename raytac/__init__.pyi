@@ -39,6 +39,7 @@ from .specs.sensor_file import load_sensor as load_sensor
 from .specs.task import TaskScene as TaskScene
 from .specs.task_file import load_scene as load_scene
 from .specs.task_file import load_task as load_task
+from .warp_messages import quiet_warp as quiet_warp
 from .world.pad_stepper import PadStepper as PadStepper
 from .world.tactile_reader import TactileReader as TactileReader
 from .world.world import TactileWorld as TactileWorld

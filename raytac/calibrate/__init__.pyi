@@ -5,6 +5,7 @@ from .fit_models import images_of as images_of
 from .light_parameters import leds_at_walls as leds_at_walls
 from .photographs import Photographs as Photographs
 from .photographs import read_photographs as read_photographs
+from .pressed_balls import contact_radius as contact_radius
 from .presses import RealPresses as RealPresses
 from .presses import by_press as by_press
 from .presses import read_presses as read_presses

@@ -11,8 +11,8 @@ import tyro
 
 from raytac.cli.shared import FitOptions, named, print_paths
 from raytac.io.options import parse_names
-from raytac.physics.soft.availability import quiet_solver
 from raytac.specs.press import PADS
+from raytac.warp_messages import quiet_warp
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,7 +48,7 @@ class CompareRealArgs(FitOptions):
         began = time.perf_counter()
         from raytac.report.real import RealSettings, check_folds, compare_real
 
-        quiet_solver()
+        quiet_warp()
         sensor, presses, shots = self.read(self.data, self.sensor)
         check_folds(presses, self.folds)
         settings = RealSettings(

@@ -19,9 +19,9 @@ from raytac.errors import InputError
 from raytac.io.options import CommonOptions
 from raytac.physics.base import PhysicsConfig
 from raytac.physics.registry import PHYSICS, scene_physics
-from raytac.physics.soft.availability import quiet_solver
 from raytac.specs import PressScene, SensorSpec, TaskScene, load_sensor, with_lights
 from raytac.specs.sensor import AUTO
+from raytac.warp_messages import quiet_warp
 
 FROM_SCRATCH = "12,8,9"
 """Numbers of LEDs of the Mini's main figures in docs/accuracy.md.
@@ -130,7 +130,7 @@ class SolverOptions(CommonOptions):
     def prepare_warp(self) -> None:
         """Call before contacts are first computed."""
         if not self.verbose:
-            quiet_solver()
+            quiet_warp()
 
 
 @dataclass(frozen=True, kw_only=True)

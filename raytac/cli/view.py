@@ -15,11 +15,11 @@ from raytac.io.options import DeviceName, parse_names, parse_resolution
 from raytac.markers import MARKERS
 from raytac.optics import OPTICS
 from raytac.physics import PHYSICS, PhysicsConfig
-from raytac.physics.soft.availability import quiet_solver
 from raytac.sensor import TactileSensor
 from raytac.specs import PADS, PressScene, TaskScene, load_scene
 from raytac.specs.sensor_file import sensor_spec
 from raytac.specs.task import COUPLINGS
+from raytac.warp_messages import quiet_warp
 
 if TYPE_CHECKING:
     from raytac.specs.sensor import SensorSpec
@@ -83,7 +83,7 @@ class ViewArgs(ShadowOptions):
         scene = load_scene(self.scene)
         physics = chosen_physics(self.physics, self.level, scene)
         if not self.verbose:
-            quiet_solver()
+            quiet_warp()
         session = self._press(scene, physics) if isinstance(scene, PressScene) else self._task(scene, physics)
         with Viewer(session, host=self.host, port=self.port, allow_hosts=allowed) as viewer:
             print(f"raytac: {session.title}")

@@ -1,5 +1,7 @@
 from .coat_mesh import CoatMesh as CoatMesh
 from .coat_mesh import DeformedCoat as DeformedCoat
+from .gaussian import LAYER_STEPS as LAYER_STEPS
+from .gaussian import PYRAMID_SIGMAS as PYRAMID_SIGMAS
 from .pyramid import ElasticSurround as ElasticSurround
 from .surface import GelSurface as GelSurface
 from .surface import PadGrid as PadGrid

@@ -14,7 +14,6 @@ from .rigid.contacts import PadContacts as PadContacts
 from .rigid.load_law import first_touch as first_touch
 from .rigid.pad import RigidPad as RigidPad
 from .rigid.search import PadSearch as PadSearch
-from .soft.availability import quiet_solver as quiet_solver
 from .soft.bodies import ScenePad as ScenePad
 from .soft.bodies import pad_body as pad_body
 from .soft.bodies import scene_body as scene_body

@@ -210,11 +210,11 @@ def test_rigid_and_soft_agree_in_contact_and_differ_around_it(pressed):
     one, two = state.surface, reached(states).surface
     both = one.contact[0] & two.contact[0]
     assert both.sum() > 20 and np.abs(one.height[0] - two.height[0])[both].max() < 10e-6
-    # What the rigid pad touches, about π R δ as on a half-space, the simulated one touches too, and more, as a layer does, but not 2 π R δ.
-    assert one.contact[0].sum() * PITCH**2 == pytest.approx(math.pi * RADIUS * 0.6e-3, rel=0.06)
+    # Both contacts are wider than the π R δ of a half-space, as on a layer, but not 2 π R δ.
+    assert one.contact[0].sum() == pytest.approx(two.contact[0].sum(), rel=0.03)
     assert two.contact[0][one.contact[0]].mean() > 0.99
     assert 1.1 < two.contact[0].sum() * PITCH**2 / (math.pi * RADIUS * 0.6e-3) < 1.6
-    # The gel hardly changes its volume: pressed down in one place it comes up around it, which Gaussians cannot.
+    # The gel hardly changes its volume: pressed down in one place it comes up around it, which the rigid pad leaves out.
     assert two.indentation.min() < -5e-6 and one.indentation.min() > -1e-7
     rho = np.hypot(pad.grid.x[None, :], pad.grid.y[:, None])
     around = (rho > 2.5e-3) & (rho < 5e-3)

@@ -1,4 +1,4 @@
-"""Messages of Warp, in which contacts are computed."""
+"""Messages of Warp, in which contacts, gel surfaces and the solver are computed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from raytac.device import cuda_device_count
 from raytac.installation import foreign_ipc
 
 
-def quiet_solver() -> None:
+def quiet_warp() -> None:
     """Let Warp print only warnings and errors in this process.
 
     Warp otherwise lists devices and every module that it loads. The level belongs to the process, so ``ipc`` and ``TactileSensor`` leave it
