@@ -1,4 +1,7 @@
-"""Kernels of ``StepSums``: forces, boxes and motions of whole bodies, and forces between two of them."""
+"""Kernels of ``StepSums``.
+
+Forces, boxes and motions of whole bodies, and forces between two of them.
+"""
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
 # pyright: reportGeneralTypeIssues=false, reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false

@@ -1,4 +1,7 @@
-"""Sums over whole bodies and pairs of them: what a robot's simulator needs to know of a step, in one small array of the device."""
+"""Sums over whole bodies and pairs of them.
+
+What a robot's simulator needs to know of a step, in one small array of the device.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,9 @@ _PAIR_SHAPES: dict[str, tuple[int, ...]] = {"pair_normal": (3,), "pair_place": (
 
 
 class StepSums:
-    """Sums of the present state by body (B, bodies, …) and by pair of bodies (B, P, …), world frame.
+    """Sums of the present state by body (B, bodies, …) and by pair of bodies (B, P, …).
+
+    World frame.
 
     ``arrays`` are Warp arrays of the device by name, float64, one after the other in one memory; ``launch`` writes them. ``host`` has the
     same in NumPy, of one copy, made at the first look after ``expire``.

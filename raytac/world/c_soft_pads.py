@@ -128,7 +128,10 @@ class CSoftPads(SoftPads):
     def _follow(
         self, failed: np.ndarray, cases: np.ndarray, driven: dict[str, np.ndarray], dt: np.ndarray, due: np.ndarray
     ) -> SceneReport:
-        """Step the solver (``_solve``), show its bodies in MuJoCo and begin an interval of the coupling."""
+        """Step the solver (``_solve``).
+
+        Show its bodies in MuJoCo and begin an interval of the coupling.
+        """
         report = self._solve(failed, cases, driven, dt, due)
         alive = np.flatnonzero(due & ~failed).tolist()
         self._mirror(alive)

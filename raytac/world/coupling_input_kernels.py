@@ -1,4 +1,7 @@
-"""Kernel of ``CouplingInputs``: wrenches, contacts and solver bodies of an interval from the solver's sums."""
+"""Kernel of ``CouplingInputs``.
+
+Wrenches, contacts and solver bodies of an interval from the solver's sums.
+"""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -53,12 +56,18 @@ class Names:
     body: wp.array2d(dtype=wp.int32)
     """Solver's numbers of the two, (P, 2)."""
     terms: wp.array3d(dtype=wp.float64)
-    """``pad_stiffness_terms`` of each of the solver's bodies, (bodies, 4, 2); 0 of one that is no pad."""
+    """``pad_stiffness_terms`` of each of the solver's bodies, (bodies, 4, 2).
+
+    0 of one that is no pad.
+    """
 
 
 @wp.struct
 class Patches:
-    """Bonded soft bodies that are touched, H an environment; they follow the free ones among the solver's bodies."""
+    """Bonded soft bodies that are touched, H an environment.
+
+    They follow the free ones among the solver's bodies.
+    """
 
     touched: wp.array2d(dtype=wp.int32)
     mass: wp.array2d(dtype=wp.float64)
@@ -101,7 +110,10 @@ def side_now(names: Names, patches: Patches, env: wp.int32, pair: wp.int32, end:
 
 @wp.func
 def write_stiffness(names: Names, sums: Sums, env: wp.int32, pair: wp.int32, k: wp.int32, contacts: Contacts):
-    """K of a pair: two pads in contact are springs in series, so that the bound of either holds for both."""
+    """K of a pair: two pads in contact are springs in series.
+
+    So that the bound of either holds for both.
+    """
     for i in range(6):
         for j in range(6):
             contacts.stiffness[env, k, i, j] = _0

@@ -1,4 +1,7 @@
-"""``CouplingInputs``: what a step of the contact solver gives to ``Coupling``, on one device."""
+"""``CouplingInputs``: what a step of the contact solver gives to ``Coupling``.
+
+On one device.
+"""
 
 from __future__ import annotations
 
@@ -112,7 +115,10 @@ class CouplingInputs:
         return result
 
     def _read_patches(self, patches: Any, envs: np.ndarray) -> None:
-        """Patches of bonded soft bodies, which the solver condenses on the host, one after the other."""
+        """Patches of bonded soft bodies, which the solver condenses on the host.
+
+        One after the other.
+        """
         if not self._bonded:
             return
         fields = {name: getattr(patches, name).numpy() for name in kernels.Patches.vars}

@@ -1,4 +1,7 @@
-"""Kernels of ``Coupling``: contacts of an interval, and the implicit law in a step of MuJoCo; one thread an environment."""
+"""Kernels of ``Coupling``.
+
+Contacts of an interval, and the implicit law in a step of MuJoCo; one thread an environment.
+"""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -16,7 +19,10 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
 NOTHING = wp.constant(-1)
-"""Side of a contact that stands still. Bodies of MuJoCo are 0 and more, bodies of the solver −2 and less."""
+"""Side of a contact that stands still.
+
+Bodies of MuJoCo are 0 and more, bodies of the solver −2 and less.
+"""
 
 
 @wp.struct
@@ -232,7 +238,10 @@ def solve_row(work: Work, env: wp.int32, row: wp.int32, n: wp.int32):
 
 @wp.func
 def add_jacobian(robot: Robot, work: Work, env: wp.int32, row: wp.int32, body: wp.int32, point: wp.vec3d, sign: wp.float64):
-    """Velocity and spin of a body's point by every degree of freedom, into rows ``row`` to ``row + 5``."""
+    """Velocity and spin of a body's point by every degree of freedom.
+
+    Into rows ``row`` to ``row + 5``.
+    """
     arm = point - robot.root[env, body]
     for d in range(robot.speed.shape[1]):
         if robot.moves[body, d] != 0:
@@ -360,7 +369,10 @@ def apply_law(
     # outputs
     interval: Interval, work: Work,
 ):  # fmt: skip
-    """Add c to ``applied``, and move the solver's bodies by a step of h [s], in the environments ``chosen`` (B,)."""
+    """Add c to ``applied``, and move the solver's bodies by a step of h [s].
+
+    In the environments ``chosen`` (B,).
+    """
     env = wp.tid()
     count = contacts.count[env] + 0
     if chosen[env] == 0 or count == 0:

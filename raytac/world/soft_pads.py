@@ -1,4 +1,6 @@
-"""Soft pads of a world: one contact solver for all gels and the bodies they touch, and what is read of it.
+"""Soft pads of a world: one contact solver for all gels and the bodies they touch.
+
+And what is read of it.
 
 MuJoCo moves the robot and the rest. Every ``soft_timestep`` it steps first, with the forces of the pads on the robot. Then the solver
 follows: cases and MuJoCo's bodies are driven to MuJoCo's poses, bodies of the solver move freely and are mirrored in MuJoCo as mocap
@@ -162,7 +164,9 @@ class SoftPads:
     def _due(
         self, cases: np.ndarray, driven: dict[str, np.ndarray], since: np.ndarray, interval: int, *, last: bool
     ) -> np.ndarray:
-        """Environments (B,) in which the solver steps now, ``since`` (B,) steps of MuJoCo after the last time.
+        """Environments (B,) in which the solver steps now.
+
+        ``since`` (B,) steps of MuJoCo after the last time.
 
         Before a contact begins, it steps early, so that MuJoCo has the contact's force before the bodies overlap far.
         """

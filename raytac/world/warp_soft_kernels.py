@@ -1,4 +1,7 @@
-"""Kernels between MuJoCo Warp and the contact solver: wrenches on links, and poses of the solver's bodies."""
+"""Kernels between MuJoCo Warp and the contact solver.
+
+Wrenches on links, and poses of the solver's bodies.
+"""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false

@@ -33,7 +33,10 @@ class WarpSoftPads(SoftPads):
     def __init__(
         self, composed: WorldModel, world: WarpWorld, cases: np.ndarray, *, physics: Ipc, coupling: str, device: str
     ) -> None:
-        """Put all pads into the solver at ``cases``; ``world`` moves the robot. Raises as ``SoftPads``."""
+        """Put all pads into the solver at ``cases``; ``world`` moves the robot.
+
+        Raises as ``SoftPads``.
+        """
         super().__init__(composed, cases, physics=physics, coupling=coupling, device=device)
         self._world, engine, model = world, world.engine, composed.model
         sites = np.array([model.site(m.site).id for m in composed.sensors], int)
@@ -53,7 +56,9 @@ class WarpSoftPads(SoftPads):
         self._graphs: dict[Any, Callable[[], None]] = {}
 
     def reset(self, envs: Sequence[int], cases: np.ndarray, bodies: Mapping[str, np.ndarray] | None, *, elsewhere: bool) -> None:
-        """Put environments back to rest at ``cases`` (B, S, 4, 4) and ``bodies``, before MuJoCo Warp's own reset.
+        """Put environments back to rest at ``cases`` (B, S, 4, 4) and ``bodies``.
+
+        Before MuJoCo Warp's own reset.
 
         Raises ``OverlapError``: bodies overlap there; nothing has changed then.
         """
@@ -130,7 +135,10 @@ class WarpSoftPads(SoftPads):
     def _follow(
         self, failed: np.ndarray, cases: np.ndarray, driven: dict[str, np.ndarray], dt: np.ndarray, due: np.ndarray
     ) -> SceneReport:
-        """Step the solver (``_solve``), show its bodies in MuJoCo Warp and begin an interval of the coupling."""
+        """Step the solver (``_solve``).
+
+        Show its bodies in MuJoCo Warp and begin an interval of the coupling.
+        """
         report = self._solve(failed, cases, driven, dt, due)
         self._mirror(due & ~failed)
         if self._law is not None and self._inputs is not None:

@@ -1,4 +1,7 @@
-"""Environments of a ``TactileWorld`` with soft pads on MuJoCo Warp: robot and gels on one device."""
+"""Environments of a ``TactileWorld`` with soft pads on MuJoCo Warp.
+
+Robot and gels on one device.
+"""
 
 from __future__ import annotations
 

@@ -194,7 +194,10 @@ class WarpStates:
 
 
 def warp_controls(control: Any, world: WarpWorld) -> wp.array | None:
-    """Constant controls (B, nu), float32, on a world's device; None holds. Raises ``InputError`` for others."""
+    """Constant controls (B, nu), float32, on a world's device; None holds.
+
+    Raises ``InputError`` for others.
+    """
     count, nu, device = world.engine.num_envs, world.composed.model.nu, world.engine.device
     if isinstance(control, wp.array):
         if control.shape != (count, nu) or control.dtype != wp.float32 or control.device != device:

@@ -141,7 +141,9 @@ STIFFNESS_POWERS = ((1, 2), (1, 2), (3, 4), (3, 4))
 
 
 def pad_stiffness_terms(gelpad: GelpadSpec) -> np.ndarray:
-    """Bound of a contact's stiffness as two powers of its radius a = √(area/π): coefficients (4, 2).
+    """Bound of a contact's stiffness as two powers of its radius a = √(area/π).
+
+    Coefficients (4, 2).
 
     Rows are tangential, normal, rocking and twisting motion; the powers of a are ``STIFFNESS_POWERS``. It is the sum of two limits of a
     rigid flat punch of the same area on a bonded layer of thickness t: one much narrower than the layer (half-space; K. L. Johnson,
