@@ -106,7 +106,7 @@ def main(args: Args) -> dict[str, Metric]:
                 _write_film(film, folder / ("film.mp4" if args.mp4 else "film.gif"))
                 _write_strip(film, folder / "strip.png")
         if args.episodes:
-            result = _rate(args, recipe) if flat is None else _flat_rate(args, flat)
+            _, result = rate(args)
             low, high = result.interval
             metrics |= {
                 "episodes": result.episodes, "failed": result.failures, "success": result.successes / result.episodes, "success_low": low,
@@ -123,11 +123,18 @@ def _flat(args: Args) -> FlatPolicy | None:
     """The policy, if ``train_gpu.py`` has written it."""
     if args.policy == "scripted":
         return None
-    try:
-        from experiments.flat_policy import FlatPolicy
-    except ImportError:  # without rsl_rl there are only those of train_ppo.py
-        return None
+    from experiments.flat_policy import FlatPolicy
+
     return FlatPolicy(Path(args.policy)) if FlatPolicy.is_one(Path(args.policy)) else None
+
+
+def rate(args: Args) -> tuple[str, Evaluation]:
+    """Task of a policy, and its success on held-out seeds."""
+    flat = _flat(args)
+    if flat is not None:
+        return flat.task, _flat_rate(args, flat)
+    recipe = _recipe(args)
+    return args.task if recipe is None else recipe.task, _rate(args, recipe)
 
 
 def _flat_rate(args: Args, policy: FlatPolicy) -> Evaluation:

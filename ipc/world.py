@@ -15,12 +15,13 @@ from ipc.contact.overlap import OverlapCheck, find_overlap
 from ipc.errors import IpcError
 from ipc.report import ContactPairs, PairForces, PatchMotion, RigidMotion, StepReport, Wrench
 from ipc.settings import Settings, barrier_stiffness
-from ipc.solver.forces import bond_wrench, contact_pairs, contact_wrench, host, pair_forces, rigid_motion, touching
+from ipc.solver.forces import bond_wrench, contact_pairs, contact_wrench, host, touching
 from ipc.solver.newton import Newton
 from ipc.solver.patch_motion import RestPatches
 from ipc.solver.potential import Potential
 from ipc.solver.rest_state import RestState
 from ipc.state import State, env_mask, per_env, start_state, teleported, unit_pose
+from ipc.sums import StepSums
 from ipc.warp_start import LAUNCH, start_warp
 
 Floats = NDArray[np.float64]
@@ -29,7 +30,8 @@ Floats = NDArray[np.float64]
 class World:
     """Bodies that deform, move and touch, in ``num_envs`` copies that do not see each other.
 
-    Threads may have a world each; their steps wait for each other.
+    Threads may have a world each; their steps wait for each other. ``sums`` are forces, boxes and motions of whole bodies
+    (:class:`ipc.sums.StepSums`), on the device and in NumPy.
 
     Args:
         bodies: of unique names.
@@ -73,6 +75,7 @@ class World:
             self._potential = Potential(self.layout, self.settings, num_envs, self.d_hat, self.kappa, self.device)
             self._newton = Newton(self._potential, self.layout, self.settings)
         self._arrays = WorldArrays(self.layout, self._potential)
+        self.sums = StepSums(self.layout, self.bodies, self._potential)
         self._failed = np.zeros(num_envs, bool)
         self._patches: dict[int, RestPatches] = {}
         self._check_overlap = OverlapCheck(self.layout)
@@ -139,6 +142,7 @@ class World:
         v = host(self._potential.v).copy()
         v[mask, nodes] = per_env(velocity, (3,), "velocity", self.num_envs)[mask, None]
         self._potential.v.assign(v)
+        self.sums.expire()
         self._expected[mask] = False
 
     def step(self, dt: ArrayLike | None = None, envs: ArrayLike | None = None) -> StepReport:
@@ -159,6 +163,7 @@ class World:
                 self._expected |= alive
             values = self._newton.step(alive)
             self._arrays.update()
+            self.sums.expire()
         self._failed |= values["failed"].astype(bool)
         return StepReport(
             converged=values["converged"].astype(bool) | (~chosen & ~self._failed),
@@ -216,6 +221,7 @@ class World:
             if self._rest is None:
                 self._rest = RestState(self.layout, self.settings, self._potential)
             self._rest.carry(chosen)
+            self.sums.expire()
         self._expected |= chosen
 
     def _can_rest(self) -> bool:
@@ -343,12 +349,21 @@ class World:
 
     def pressing(self) -> dict[tuple[str, str], PairForces]:
         """Forces at the end of the last step by names of two bodies that touch in any environment."""
-        return pair_forces(self.layout, self._potential)
+        sums, result = self.sums.host, {}
+        for p, (one, two) in enumerate(self.layout.pairs.tolist()):
+            place = sums["pair_place"][:, p]
+            if np.isfinite(place).any():
+                wrench = np.concatenate([sums["pair_force"][:, p], sums["pair_torque"][:, p]], axis=1)
+                names = self.layout.names[one], self.layout.names[two]
+                result[names] = PairForces(sums["pair_normal"][:, p].copy(), place.copy(), wrench)
+        return result
 
     def rigid_motion(self, name: str) -> RigidMotion:
         """Mass, centre, inertia and velocities of a soft or affine body as if it were rigid now."""
         self._nodes(name)
-        return rigid_motion(self.layout, self._potential, self._index(name))
+        body, sums = self._index(name), self.sums.host
+        values = [sums[key][:, body].copy() for key in ("centre", "inertia", "velocity", "spin")]
+        return RigidMotion(float(self.sums.mass[body]), *values)
 
     def held_patch(self, name: str, env: int) -> PatchMotion | None:
         """The part of a bonded soft body under contact forces, as if it moved as a whole.
@@ -442,6 +457,7 @@ class World:
             s.set_frames(wp.zeros(self.num_envs, dtype=wp.float64, device=self.device), s.R, s.t)
             s.place_vertices(s.y, s.R, s.t, s.x)
             self._arrays.update()
+            self.sums.expire()
 
     def reset(self, envs: ArrayLike | None = None) -> None:
         """Put environments (a mask (B,), a list, or None for all) back to the start of the world."""

@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from ipc.bodies.layout import Layout
-from ipc.report import ContactPairs, PairForces, RigidMotion, Wrench
+from ipc.report import ContactPairs, Wrench
 from ipc.solver.potential import Potential
 
 Floats = NDArray[np.float64]
@@ -110,50 +110,6 @@ def contact_pairs(layout: Layout, potential: Potential, env: int) -> ContactPair
         gap=host(contacts.gap)[env, :n].copy(),
         force=host(contacts.force)[env, :n].copy(),
     )
-
-
-def pair_forces(layout: Layout, potential: Potential) -> dict[tuple[str, str], PairForces]:
-    """Forces by names of the two bodies; pairs that touch in no environment are left out."""
-    x = host(potential.x)
-    batch, forces = len(x), _all_forces(potential)
-    points, signs = [f.points(layout, x) for f in forces], [f.side(layout)[:, None] for f in forces]
-    result = {}
-    for p in np.unique(forces[0].pair):
-        normal, middle, weight, wrench = np.zeros((batch, 3)), np.zeros((batch, 3)), np.zeros(batch), np.zeros((batch, 6))
-        for k, (some, at, sign) in enumerate(zip(forces, points, signs, strict=True)):
-            mine = some.pair == p
-            env, force = some.env[mine], (sign * some.force)[mine]
-            if k == 0:
-                size = np.linalg.norm(force, axis=1)
-                np.add.at(normal, env, force)
-                np.add.at(middle, env, size[:, None] * at[mine])
-                np.add.at(weight, env, size)
-                with np.errstate(invalid="ignore", divide="ignore"):
-                    place = middle / weight[:, None]
-            arm = at[mine] - np.nan_to_num(place)[env]
-            np.add.at(wrench, env, np.concatenate([force, np.cross(arm, force)], axis=1))
-        result[tuple(layout.names[b] for b in layout.pairs[p])] = PairForces(normal, place, wrench)
-    return result
-
-
-def rigid_motion(layout: Layout, potential: Potential, body: int) -> RigidMotion:
-    """Mass, centre, inertia and velocities of a body with nodes as if it moved as a whole."""
-    first, last = layout.node_start[body : body + 2]
-    row, end = layout.row_start[[first, last]]
-    rows = np.repeat(np.arange(last - first), np.diff(layout.row_start[first : last + 1]))
-    mass = np.zeros((last - first, last - first))
-    mass[rows, layout.col[row:end] - first] = layout.mass[row:end]
-    R, t, nodes = host(potential.R)[:, body], host(potential.t)[:, body], slice(first, last)
-    x = np.einsum("bij,bnj->bni", R, host(potential.y)[:, nodes]) + t[:, None]
-    v, share = host(potential.v)[:, nodes], mass.sum(axis=0)
-    total = float(share.sum())
-    centre, velocity = (np.einsum("n,bni->bi", share / total, a) for a in (x, v))
-    arm = x - centre[:, None]
-    second = np.einsum("bni,nm,bmj->bij", arm, mass, arm)
-    inertia = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
-    momentum = np.cross(arm, np.einsum("nm,bmi->bni", mass, v - velocity[:, None])).sum(axis=1)
-    spin = np.linalg.solve(inertia, momentum[..., None])[..., 0]
-    return RigidMotion(total, centre, inertia, velocity, spin)
 
 
 def touching(layout: Layout, potential: Potential, body: int) -> dict[str, NDArray[np.bool_]]:

@@ -12,7 +12,7 @@ import warp as wp
 from raytac.errors import InputError
 from raytac.robots.arm import Arm
 from raytac.robots.arm_kernels import Springs, joint_springs
-from raytac.robots.states import ControlWriter, StateReader
+from raytac.robots.states import NumberWriter, StateReader
 from raytac.warp_runtime import Recorded
 
 _READ = ("time", "joints", "speed", "bias", "mass")
@@ -28,7 +28,7 @@ class JointSprings:
         self.arm, self._datas = arm, tuple(datas)
         count, n = len(self._datas), len(arm)
         self._reader = StateReader(self._datas, {name: one for name, one in arm.numbers().items() if name in _READ})
-        self._writer = None if arm.motors is None else ControlWriter(self._datas, [*arm.motors.tolist(), *others])
+        self._writer = None if arm.motors is None else NumberWriter(self._datas, "ctrl", [*arm.motors.tolist(), *others])
         springs = Springs()
         springs.time, springs.joints, springs.speed, springs.bias, springs.mass = (self._reader.arrays[name] for name in _READ)
         springs.target, springs.target_speed = (wp.zeros((count, n), dtype=wp.float64, device="cpu") for _ in range(2))
@@ -37,7 +37,7 @@ class JointSprings:
         if self._writer is None:
             springs.torque = wp.zeros((count, n), dtype=wp.float64, device="cpu")
         else:
-            springs.torque = self._writer.controls
+            springs.torque = self._writer.array
         self._target, self._speed = springs.target.numpy(), springs.target_speed.numpy()
         self._start, controls = springs.start.numpy(), springs.torque.numpy()
         self._torque, self._others = controls[:, :n], controls[:, n:]

@@ -116,29 +116,29 @@ class StateReader:
         return {key: copied[part].reshape(shape) for key, (part, shape) in self._parts.items()}
 
 
-class ControlWriter:
-    """Writes some controls of B states together.
+class NumberWriter:
+    """Writes some numbers of one member of B states together.
 
     Attributes:
-        controls: Warp array (B, n), the next controls.
+        array: Warp array (B, n), the next numbers; ``values`` is the same memory in NumPy.
     """
 
-    def __init__(self, datas: Sequence[mujoco.MjData], actuators: Sequence[int] | np.ndarray) -> None:
-        """Look up the controls of ``actuators`` (n,) in ``datas``."""
+    def __init__(self, datas: Sequence[mujoco.MjData], member: str, index: Sequence[int] | np.ndarray) -> None:
+        """Look up entries ``index`` (n,) of a flat member of ``datas``."""
         start_warp()
         self._datas = tuple(datas)
         count = len(self._datas)
-        self.controls = wp.zeros((count, len(actuators)), dtype=wp.float64, device="cpu")
-        self._values = self.controls.numpy()
+        self.array = wp.zeros((count, len(index)), dtype=wp.float64, device="cpu")
+        self.values = self.array.numpy()
         self._chosen = wp.zeros(count, dtype=wp.int32, device="cpu")
         self._mask = self._chosen.numpy()
-        places = wp.array([_place(data, "ctrl") for data in self._datas], dtype=wp.uint64, device="cpu")
-        inputs = [places, wp.array(list(actuators), dtype=wp.int32, device="cpu"), self.controls, self._chosen]
-        self._write = Recorded(partial(wp.launch, write_numbers, dim=self.controls.shape, inputs=inputs, device="cpu"))
+        places = wp.array([_place(data, member) for data in self._datas], dtype=wp.uint64, device="cpu")
+        inputs = [places, wp.array(list(index), dtype=wp.int32, device="cpu"), self.array, self._chosen]
+        self._write = Recorded(partial(wp.launch, write_numbers, dim=self.array.shape, inputs=inputs, device="cpu"))
 
     def write(self, envs: Sequence[int] | np.ndarray) -> np.ndarray | None:
-        """Write the controls of environments; or return the first that are not finite, writing none."""
-        chosen = self._values if len(envs) == len(self._datas) else self._values[envs]
+        """Write the numbers of environments; or return the first that are not finite, writing none."""
+        chosen = self.values if len(envs) == len(self._datas) else self.values[envs]
         # One number that is not finite makes the sum such.
         if not np.isfinite(chosen.sum()):
             return next(row for row in chosen if not np.isfinite(row).all())

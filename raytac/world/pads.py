@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from raytac.physics.soft.scene import SoftScene
 
 WORLD_PADS: Registry[Any] = Registry(
-    "physics", {"rigid": "raytac.world.rigid_pads:rigid_pads", "ipc": "raytac.world.soft_pads:SoftPads"}
+    "physics", {"rigid": "raytac.world.rigid_pads:rigid_pads", "ipc": "raytac.world.c_soft_pads:CSoftPads"}
 )
 """Makers of pads, called with ``(composed, models, datas, *, physics, coupling, device)``.
 

@@ -1,24 +1,24 @@
-"""Soft pads in a MuJoCo world: one contact solver for all gels and the bodies they touch.
+"""Soft pads of a world: one contact solver for all gels and the bodies they touch.
+
+And what is read of it.
 
 MuJoCo moves the robot and the rest. Every ``soft_timestep`` it steps first, with the forces of the pads on the robot. Then the solver
 follows: cases and MuJoCo's bodies are driven to MuJoCo's poses, bodies of the solver move freely and are mirrored in MuJoCo as mocap
-bodies.
+bodies. ``CSoftPads`` does this with C MuJoCo, ``WarpSoftPads`` with MuJoCo Warp.
 """
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 from itertools import combinations
 
-import mujoco
 import numpy as np
 import warp as wp
 
 import ipc
 from raytac.device import resolve_device
-from raytac.errors import InputError, OverlapError, SpecError
+from raytac.errors import InputError, SpecError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.physics.base import PadReading
 from raytac.physics.configs import Ipc
@@ -28,26 +28,19 @@ from raytac.physics.soft.coat_points import CoatMarkers, CoatTraction
 from raytac.physics.soft.mesh import pad_mesh
 from raytac.physics.soft.scene import SoftScene
 from raytac.physics.soft.scene_state import SceneReport
-from raytac.robots.frames import body_poses, site_poses
-from raytac.se3 import pose_of, quaternion
+from raytac.se3 import pose_of
 from raytac.shapes.point_depth import SOLIDS, point_depth
 from raytac.shapes.triangulate import enclosed_volume, object_surface
 from raytac.specs.press import PADS
 from raytac.specs.task import PAIR_FRICTION, TaskScene
-from raytac.world.coupling import Coupling, coupling_inputs
-from raytac.world.environment_models import EnvironmentModels
-from raytac.world.forbidden_overlap import Inside, RobotOverlap
+from raytac.world.coupling_inputs import CouplingInputs
 from raytac.world.warp_frame import WarpFrame
 from raytac.world.world_model import WorldModel
-from raytac.world.world_state import Drive, lost
 
 _TOUCH = 1e-5
 """Distance from a soft body's holder within which its vertices are bonded to it [m]."""
 _CELLS = 8
 """Cells of a soft body along its longest edge where the scene does not say."""
-
-_INSIDE = 1e-4
-"""Most overlap of a body with a case or link that is not reported [m]: rounding."""
 
 _REPORT = {
     **{"min_gap": np.inf, "min_det": 1.0, "blocked": 0.0, "converged": True},
@@ -57,26 +50,17 @@ _REPORT = {
 
 
 class SoftPads:
-    """All pads of a world, B environments, as one ``SoftScene``."""
+    """All pads of a world, B environments, as one ``SoftScene``; the engine's class steps it."""
 
-    def __init__(
-        self,
-        composed: WorldModel,
-        models: EnvironmentModels,
-        datas: Sequence[mujoco.MjData],
-        *,
-        physics: Ipc,
-        coupling: str,
-        device: str,
-    ) -> None:
-        """Put all pads into the solver where MuJoCo has them; ``coupling``: of ``COUPLINGS``.
+    def __init__(self, composed: WorldModel, cases: np.ndarray, *, physics: Ipc, coupling: str, device: str) -> None:
+        """Put all pads into the solver at ``cases``, ``world_from_pad`` (B, S, 4, 4).
 
         Raises:
             BackendError: the solver is not installed, or the device does not work here.
             SpecError: a body that the solver cannot hold, or with two-way coupling a held soft one with too many cells.
-            OverlapError: bodies overlap at the start, or one of the solver's lies inside a case or a link.
+            OverlapError: bodies overlap at the start.
         """
-        self.composed, self.model, self._models, self._datas = composed, composed.model, models, tuple(datas)
+        self.composed, count = composed, len(cases)
         assert composed.scene is not None, "a world of a given MuJoCo model has rigid pads"
         self._scene, level = composed.scene, physics.level or PADS[0]
         scene = self._scene
@@ -84,110 +68,112 @@ class SoftPads:
             ScenePad(mounted.name, spec, pad_mesh(spec.gelpad, level), correction=physics.correction)
             for mounted, spec in zip(composed.sensors, composed.sensor_specs, strict=True)
         ]
-        self._links = [int(self.model.body(m.body).id) for m in composed.sensors]
-        self._sites = [int(self.model.site(m.site).id) for m in composed.sensors]
         self._own = [b for b in composed.touched if b.mocap >= 0]
         """Bodies that belong to the solver."""
         self._driven = [b for b in composed.touched if b.is_free]
         """Bodies that belong to MuJoCo."""
         bodies = [_solver_body(scene, i) for i in range(len(scene.bodies))]
-        starts = {b.name: pose_of(b.position, b.quaternion) for b in scene.bodies}
+        self._starts = {b.name: pose_of(b.position, b.quaternion) for b in scene.bodies}
         self.soft = SoftScene(
             pads,
             bodies,
-            self._pad_poses(datas),
-            starts,
+            cases,
+            self._starts,
             dt=scene.soft_timestep,
             gravity=scene.gravity,
             friction=_pair_friction(scene),
             ignored=[(b.name, b.held_by) for b in scene.bodies if b.held_by is not None],
-            num_envs=len(datas),
+            num_envs=count,
             device=resolve_device(device, ray_tracing=False),
         )
-        self._robot = RobotOverlap(composed)
-        self._warned: set[tuple[str, str]] = set()
-        self._refuse_inside(datas, range(len(datas)))
-        self._coupling = None
+        self._inputs = None
         if coupling == "two_way":
-            felt = self._links + [b.index for b in self._driven]
-            self._felt = dict(zip([*(m.name for m in composed.sensors), *(b.name for b in self._driven)], felt, strict=True))
-            self._coupling = Coupling(self.model, felt, len(datas))
+            self._inputs = CouplingInputs(self.soft, [*(m.name for m in composed.sensors), *(b.name for b in self._driven)])
             self._prepare_bonded()
-        self._last_cases = self._pad_poses(datas)
-        self._last_driven = {b.name: np.stack([starts[b.name]] * len(datas)) for b in self._driven}
+        self._last_cases = cases.copy()
+        self._last_driven = {b.name: np.stack([self._starts[b.name]] * count) for b in self._driven}
         self._traction: dict[str, CoatTraction] = {}
         self._markers: dict[str, CoatMarkers] = {}
-        self._wrench = {m.name: np.zeros((len(datas), 6)) for m in composed.sensors}
-        self._unconverged = np.zeros(len(datas), int)
+        self._wrench = {m.name: np.zeros((count, 6)) for m in composed.sensors}
+        self._unconverged = np.zeros(count, int)
         """Steps of the solver since the reset that did not meet its tolerance."""
         self.report: dict[str, np.ndarray] = {}
 
-    def reset(self, envs: Sequence[int], bodies: Mapping[str, np.ndarray] | None = None) -> None:
-        """Put environments back to the start: gels at rest, no forces, bodies where they began.
+    @property
+    def coupled_bodies(self) -> list[int]:
+        """Bodies of MuJoCo that the solver acts on, in the order of the coupling's inputs."""
+        links = [int(self.composed.model.body(mounted.body).id) for mounted in self.composed.sensors]
+        return [*links, *(body.index for body in self._driven)]
 
-        ``bodies``: not None if they or the robot start elsewhere: name to poses (n, 4, 4) of the environments named; the cases are where
-        MuJoCo has them.
-
-        Raises ``OverlapError``: bodies overlap there; the solver has not changed then, what MuJoCo shows of its bodies has.
-        """
-        datas = self._datas
-        cases, chosen = self._pad_poses(datas), list(envs)
-        begin = {b.name: pose_of(b.position, b.quaternion) for b in self._scene.bodies}
-        starts = {name: np.repeat(at[None], len(datas), axis=0) for name, at in begin.items()}
+    def _starting(self, envs: Sequence[int], bodies: Mapping[str, np.ndarray] | None) -> dict[str, np.ndarray]:
+        """Poses (B, 4, 4) of all bodies at the start; ``bodies``: other ones of the n environments."""
+        starts = {name: np.repeat(at[None], self.soft.num_envs, axis=0) for name, at in self._starts.items()}
         for name, at in (bodies or {}).items():
-            starts[name][chosen] = at
-        kept = np.isin(np.arange(len(datas)), chosen, invert=True)
-        if bodies is None:
-            self.soft.reset(chosen)
-        else:
-            self._show(datas, chosen, starts)
-            self._refuse_inside(datas, chosen, only_rigid=True)  # soft ones are where they were, not where they will be
-            self.soft.reset(chosen, np.where(kept[:, None, None, None], self._last_cases, cases), starts)
-        for b in envs:
-            self._last_cases[b] = cases[b]
-            for body in self._driven:
-                self._last_driven[body.name][b] = starts[body.name][b]
-            self._unconverged[b] = 0
-            for wrench in self._wrench.values():
-                wrench[b] = 0.0
-            for key, values in self.report.items():
-                values[b] = _REPORT.get(key, 0.0)
-            if self._coupling is not None:
-                self._coupling.reset(b, datas[b])
-            self._mirror(datas, [b])
+            starts[name][list(envs)] = at
+        return starts
 
-    def advance(self, drive: Drive, failed: np.ndarray) -> None:
-        """Take one control step of all environments; failures are marked in ``failed`` (B,).
+    def _restart(self, envs: Sequence[int], cases: np.ndarray, starts: Mapping[str, np.ndarray], *, elsewhere: bool) -> None:
+        """Reset the solver and all readings of environments, which begin ``elsewhere`` or not.
 
-        Those that fail stand still.
-        An environment fails if its state is not finite, if its last step did not meet the solver's tolerance, or, with a
-        ``RuntimeWarning``, if it moves too fast to be resolved near a contact.
-
-        Raises ``InputError``: the only environment moves too fast; it has failed then, until it is reset.
+        Raises ``OverlapError``: bodies overlap there; nothing has changed then.
         """
-        scene, timestep, datas = self._scene, self.composed.timestep, self._datas
-        interval, since, reports = round(scene.soft_timestep / timestep), np.zeros(len(datas), int), []
-        steps = round(scene.control_timestep / timestep)
-        for step in range(1, steps + 1):
-            for b, data in enumerate(datas):
-                if not failed[b]:
-                    failed[b] = not self._ahead(data, b, drive)
-            since += 1
-            cases, driven = self._now(datas, failed)
-            # Before a contact begins, the solver steps early, so that MuJoCo has the contact's force before the bodies overlap far.
-            due = (since == interval) | (step == steps)
-            if self._coupling is not None and not due.all():
-                due |= ~self.soft.is_small(cases, driven, since * timestep)
-            if due.any():
-                reports.append(self._follow(datas, failed, cases, driven, since * timestep, due))
-                since[due] = 0
+        chosen = list(envs)
+        if elsewhere:
+            kept = np.isin(np.arange(self.soft.num_envs), chosen, invert=True)
+            self.soft.reset(chosen, np.where(kept[:, None, None, None], self._last_cases, cases), starts)
+        else:
+            self.soft.reset(chosen)
+        self._last_cases[chosen], self._unconverged[chosen] = cases[chosen], 0
+        for body in self._driven:
+            self._last_driven[body.name][chosen] = starts[body.name][chosen]
+        for wrench in self._wrench.values():
+            wrench[chosen] = 0.0
+        for key, values in self.report.items():
+            values[chosen] = _REPORT.get(key, 0.0)
+
+    def _solve(
+        self, failed: np.ndarray, cases: np.ndarray, driven: dict[str, np.ndarray], dt: np.ndarray, due: np.ndarray
+    ) -> SceneReport:
+        """Step the solver by ``dt`` (B,) [s] to MuJoCo's poses, in environments ``due`` (B,)."""
+        try:
+            report = self.soft.step(cases, driven, dt, due)
+        except InputError:
+            failed[:] = True  # MuJoCo is ahead of the solver
+            raise
+        self._last_cases[due] = cases[due]
+        for name, pose in driven.items():
+            self._last_driven[name][due] = pose[due]
+        failed |= report.failed
+        sums = self.soft.world.sums.host
+        failed |= due & ~(np.isfinite(sums["force"]).all(axis=(1, 2)) & np.isfinite(sums["torque"]).all(axis=(1, 2)))
+        for k, mounted in enumerate(self.composed.sensors):
+            turn, world = cases[:, k, :3, :3], self.soft.wrench(mounted.name)
+            split = [np.einsum("bji,bj->bi", turn, world[:, at : at + 3]) for at in (0, 3)]
+            self._wrench[mounted.name][due] = np.concatenate(split, axis=1)[due]
+        return report
+
+    def _conclude(self, reports: Sequence[SceneReport], failed: np.ndarray) -> None:
+        """Report all steps of the solver in a control step, and freeze what failed (B,)."""
         whole = reduce(SceneReport.then, reports)
         failed |= ~whole.last_converged
         if (failed & ~self.soft.failed).any():
             self.soft.fail(failed)
-        self.report = {key: np.broadcast_to(getattr(whole, key), len(datas)).copy() for key in _REPORT}
-        self.report["inside_robot"] = self._depth_inside(datas, failed)
+        self.report = {key: np.broadcast_to(getattr(whole, key), len(failed)).copy() for key in _REPORT}
         self._unconverged += whole.unconverged
+
+    def _due(
+        self, cases: np.ndarray, driven: dict[str, np.ndarray], since: np.ndarray, interval: int, *, last: bool
+    ) -> np.ndarray:
+        """Environments (B,) in which the solver steps now.
+
+        ``since`` (B,) steps of MuJoCo after the last time.
+
+        Before a contact begins, it steps early, so that MuJoCo has the contact's force before the bodies overlap far.
+        """
+        due = (since == interval) | last
+        if self._inputs is not None and not due.all():
+            due |= ~self.soft.is_small(cases, driven, since * self.composed.timestep)
+        return due
 
     @property
     def meshes(self) -> tuple[str, ...]:
@@ -244,7 +230,7 @@ class SoftPads:
         return []
 
     def _prepare_bonded(self) -> None:
-        """Invert the stiffness of bonded soft bodies now, for ``coupling_inputs`` at first touch."""
+        """Invert the stiffness of bonded soft bodies now, for ``CouplingInputs`` at first touch."""
         scene = self._scene
         for i, body in enumerate(scene.bodies):
             if body.held_by is None:
@@ -254,108 +240,6 @@ class SoftPads:
             except ipc.IpcError as error:
                 cell = None if body.cell is None else float(f"{body.cell * 1e3:.6g}")
                 raise SpecError(str(error), file=scene.source, key=f"body[{i}].cell_mm", value=cell) from error
-
-    def _ahead(self, data: mujoco.MjData, b: int, drive: Drive) -> bool:
-        """Take one step of MuJoCo; False if the state is no longer valid."""
-        mujoco.mj_step1(self._models[b], data)
-        drive([b])
-        if self._coupling is not None:
-            self._coupling.apply(data, b)
-        mujoco.mj_step2(self._models[b], data)
-        if lost([data])[0]:
-            return False
-        mujoco.mj_kinematics(self._models[b], data)
-        mujoco.mj_comPos(self._models[b], data)
-        return True
-
-    def _now(self, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """MuJoCo's poses of cases and of its bodies; failed environments keep their last ones."""
-        cases = np.where(failed[:, None, None, None], self._last_cases, self._pad_poses(datas))
-        now = {body.name: body_poses(datas, body.index) for body in self._driven}
-        return cases, {name: np.where(failed[:, None, None], self._last_driven[name], pose) for name, pose in now.items()}
-
-    def _follow(
-        self,
-        datas: Sequence[mujoco.MjData],
-        failed: np.ndarray,
-        cases: np.ndarray,
-        driven: dict[str, np.ndarray],
-        dt: np.ndarray,
-        due: np.ndarray,
-    ) -> SceneReport:
-        """Step the solver by ``dt`` (B,) [s] to MuJoCo's poses, in environments ``due`` (B,)."""
-        try:
-            report = self.soft.step(cases, driven, dt, due)
-        except InputError:
-            failed[:] = True  # MuJoCo is ahead of the solver
-            raise
-        self._last_cases[due] = cases[due]
-        for name, pose in driven.items():
-            self._last_driven[name][due] = pose[due]
-        failed |= report.failed
-        alive = np.flatnonzero(due & ~failed).tolist()
-        self._mirror(datas, alive)
-        if self._coupling is not None:
-            inputs = coupling_inputs(self.soft, self._felt)
-            for b in alive:
-                failed[b] = not np.isfinite(inputs[b][0]).all()
-                if not failed[b]:
-                    self._coupling.update(datas[b], b, *inputs[b])
-        for k, mounted in enumerate(self.composed.sensors):
-            turn, world = cases[:, k, :3, :3], self.soft.wrench(mounted.name)
-            split = [np.einsum("bji,bj->bi", turn, world[:, at : at + 3]) for at in (0, 3)]
-            self._wrench[mounted.name][due] = np.concatenate(split, axis=1)[due]
-        return report
-
-    def _mirror(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray) -> None:
-        """Set the mocap bodies to the poses of the solver's bodies."""
-        self._show(datas, envs, {body.name: self.soft.pose(body.name) for body in self._own})
-
-    def _show(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | np.ndarray, poses: Mapping[str, np.ndarray]) -> None:
-        for body in self._own:
-            at = poses[body.name]
-            for b in envs:
-                datas[b].mocap_pos[body.mocap] = at[b, :3, 3]
-                datas[b].mocap_quat[body.mocap] = quaternion(at[b, :3, :3])
-        if self._own:
-            for b in envs:
-                mujoco.mj_kinematics(self._models[b], datas[b])
-
-    def _inside(
-        self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | range | np.ndarray, *, only_rigid: bool = False
-    ) -> Iterator[tuple[int, Inside]]:
-        """Overlaps with cases and links by environment: rigid bodies in MuJoCo, soft by vertices."""
-        soft = {name: self.soft.mesh(name)[0] for name, body in self.soft.bodies.items() if body.is_soft and not only_rigid}
-        for b in envs:
-            overlaps = self._robot.rigid(datas[b])
-            for name, vertices in soft.items():
-                overlaps += self._robot.soft(datas[b], name, vertices[b])
-            yield from ((int(b), one) for one in overlaps if one.depth > _INSIDE)
-
-    def _refuse_inside(self, datas: Sequence[mujoco.MjData], envs: Sequence[int] | range, *, only_rigid: bool = False) -> None:
-        for b, one in self._inside(datas, envs, only_rigid=only_rigid):
-            where = f" in environment {b}" if len(datas) > 1 else ""
-            raise OverlapError(f"{one.body!r} starts {one.depth * 1e3:.3g} mm inside the robot's geom {one.geom!r}{where}")
-
-    def _depth_inside(self, datas: Sequence[mujoco.MjData], failed: np.ndarray) -> np.ndarray:
-        """Greatest depth inside the robot [m], (B,); warns once for every pair of body and geom."""
-        depth = np.zeros(len(datas))
-        for b, one in self._inside(datas, np.flatnonzero(~failed)):
-            depth[b] = max(depth[b], one.depth)
-            if (one.body, one.geom) not in self._warned:
-                self._warned.add((one.body, one.geom))
-                rule = "bodies of the solver touch gels, fixed bodies and each other, and pass through cases and links (docs/worlds.md)"
-                where = f" in environment {b} at {datas[b].time:.3f} s"
-                warnings.warn(
-                    f"{one.body!r} is {one.depth * 1e3:.3g} mm inside the robot's geom {one.geom!r}{where}: {rule}",
-                    RuntimeWarning,
-                    stacklevel=4,
-                )
-        return depth
-
-    def _pad_poses(self, datas: Sequence[mujoco.MjData]) -> np.ndarray:
-        """``world_from_pad`` of every environment and pad, (B, S, 4, 4)."""
-        return np.stack([site_poses(datas, site) for site in self._sites], axis=1)
 
 
 def _solver_body(scene: TaskScene, index: int) -> SceneBody:

@@ -106,7 +106,7 @@ class WarpStates:
     def values(self) -> dict[str, np.ndarray]:
         """Present ``state_numbers``, (B, …) each; it waits for the device."""
         self._reader.read()
-        return {name: array.numpy().copy() for name, array in self._reader.arrays.items()}
+        return self._reader.host()
 
     def fail(self, failed: np.ndarray) -> None:
         """Mark environments (B,) as failed."""
@@ -138,20 +138,11 @@ class WarpStates:
         Raises:
             InputError: other controls, or contacts that were lost for want of memory.
         """
-        count, nu, device = self.world.engine.num_envs, self.composed.model.nu, self.world.engine.device
-        if control is None:
+        controls = warp_controls(control, self.world)
+        if controls is None:
             self.world.hold()
-        elif isinstance(control, wp.array):
-            if control.shape != (count, nu) or control.dtype != wp.float32 or control.device != device:
-                value = (control.shape, control.dtype.__name__, str(control.device))
-                raise InputError("control", value=value, rule=f"must be ({count}, {nu}) of float32 on {device}")
-            self.world.step(control)
-        elif isinstance(control, np.ndarray):
-            rows = constant_controls(control, count, nu)
-            self.world.step(wp.array(rows.astype(np.float32), dtype=wp.float32, device=device))
         else:
-            rule = "must be constant in a step on engine='mujoco_warp', which asks nothing of the host"
-            raise InputError("control", value=type(control).__name__, rule=rule, choices=("None", "NumPy array", "Warp array"))
+            self.world.step(controls)
         self._touch()
         self.world.check()
         for touch in self._touches.values():
@@ -200,3 +191,22 @@ class WarpStates:
             poses[row] = inverse(pads)[:, None] @ np.reshape(world, (1, -1, 4, 4))
         self.pads.check_beyond(envs, poses)
         return qpos
+
+
+def warp_controls(control: Any, world: WarpWorld) -> wp.array | None:
+    """Constant controls (B, nu), float32, on a world's device; None holds.
+
+    Raises ``InputError`` for others.
+    """
+    count, nu, device = world.engine.num_envs, world.composed.model.nu, world.engine.device
+    if isinstance(control, wp.array):
+        if control.shape != (count, nu) or control.dtype != wp.float32 or control.device != device:
+            value = (control.shape, control.dtype.__name__, str(control.device))
+            raise InputError("control", value=value, rule=f"must be ({count}, {nu}) of float32 on {device}")
+        return control
+    if isinstance(control, np.ndarray):
+        return wp.array(constant_controls(control, count, nu).astype(np.float32), dtype=wp.float32, device=device)
+    if control is not None:
+        rule = "must be constant in a step on engine='mujoco_warp', which asks nothing of the host"
+        raise InputError("control", value=type(control).__name__, rule=rule, choices=("None", "NumPy array", "Warp array"))
+    return None

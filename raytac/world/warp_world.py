@@ -224,14 +224,33 @@ class WarpWorld:
 
     def hold(self) -> None:
         """One control step in which everything is held at the start, as ``TactileWorld.hold`` does."""
+        if self.aim_home() == self.drive:
+            self.step()
+        else:
+            self.step(self.engine.data.ctrl)
+
+    def aim_home(self) -> Callable[[], None]:
+        """Set targets and controls to the start; returns what drives the robot there in a step."""
         if self._springs is None:
-            return self.step(self._ctrl if self.composed.scene is not None else self.engine.data.ctrl)
+            if self.composed.scene is not None:
+                wp.copy(self.engine.data.ctrl, self._ctrl)
+            return _leave
         wp.copy(self.engine.data.ctrl, self._ctrl)
         everywhere = [self._all, self._joints, self._start, self.target, self.target_speed]
         self._launch(aim_at_positions, self.target.shape, everywhere)
         if self.opening is not None:
             self._launch(set_columns, self.opening.shape, [self._all, self._gap, self.opening])
-        self.step()
+        return self.drive
+
+    def take(self, controls: wp.array) -> Callable[[], None]:
+        """Set the actuators' controls (B, nu), float32; returns what drives the robot in a step."""
+        wp.copy(self.engine.data.ctrl, controls)
+        return _leave
+
+    def begin_part(self, elapsed: float) -> None:
+        """Say that ``elapsed`` [s] of the control step have passed, where it is launched in parts."""
+        if self._springs is not None:
+            self._springs.start.fill_(-elapsed)
 
     def aim(self) -> None:
         """Launch the inverse kinematics (``PoseServo``): from the tool's targets to the joints'."""

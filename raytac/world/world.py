@@ -20,6 +20,7 @@ from raytac.markers.config import SurfaceMarkers
 from raytac.markers.pattern import MarkerPattern
 from raytac.markers.registry import markers_config
 from raytac.physics.base import PhysicsConfig
+from raytac.physics.configs import Ipc
 from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
 from raytac.robots.arm import Arm
 from raytac.se3 import rigid_poses
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
     from raytac.world.soft_pads import SoftPads
     from raytac.world.touched import TouchChoice
     from raytac.world.warp_frame import WarpFrame
+    from raytac.world.warp_soft_states import WarpSoftStates
+    from raytac.world.warp_states import WarpStates
 
 _BEYOND = 1e-2
 """Greatest excess of joints over their range at the start [rad or m].
@@ -117,8 +120,8 @@ class TactileWorld:
             coupling: ``two_way`` or ``one_way``; None is as the scene says. A rigid pad acts both ways always.
             outputs, markers, optics, resolution, device: of every sensor, as ``TactileSensor`` takes them.
             num_envs: number of environments B.
-            engine: ``mujoco``, or ``mujoco_warp`` with all states and contacts on ``device``, for rigid pads; a ``WarpEngine`` has the
-                sizes of its memory.
+            engine: ``mujoco``, or ``mujoco_warp`` with all states and contacts on ``device``; a ``WarpEngine`` has the sizes of its
+                memory.
             seed: of every random number.
             pitch: spacing of the pads' grids [m], as of ``TactileSensor``.
 
@@ -154,8 +157,6 @@ class TactileWorld:
         if is_own and self.physics.is_simulated:
             rule = "needs a task scene: in other MuJoCo models pads are rigid"
             raise InputError("physics", value=name, rule=rule, choices=("rigid",))
-        if isinstance(self.engine, WarpEngine) and self.physics.is_simulated:
-            raise InputError("physics", value=name, rule="needs engine='mujoco': MuJoCo Warp has rigid pads", choices=("rigid",))
         if coupling == "one_way" and not self.physics.is_simulated:
             raise InputError(
                 "coupling", value=coupling, rule="is for soft pads: a rigid pad acts both ways", choices=("two_way",)
@@ -185,14 +186,19 @@ class TactileWorld:
         self._markers = None if markers is None else markers_config(markers)
         self.model = self.composed.model
         self.arm: Arm | None = self.composed.arm
-        if isinstance(self.engine, WarpEngine):
+        if isinstance(self.engine, WarpEngine) and isinstance(self.physics, Ipc):
+            from raytac.world.warp_soft_states import WarpSoftStates
+
+            soft = {"physics": self.physics, "coupling": self.coupling}
+            self._states: CStates | WarpStates | WarpSoftStates = WarpSoftStates(
+                self.composed, num_envs, self.engine, device, **soft
+            )
+        elif isinstance(self.engine, WarpEngine):
             from raytac.world.warp_states import WarpStates
 
             felt = "height" in ((outputs,) if isinstance(outputs, str) else outputs) or markers is not None
             grids = {one: sensor.grid for one, sensor in self._frames.sensors.items()} if felt else {}
-            self._states: CStates | WarpStates = WarpStates(
-                self.composed, num_envs, self.engine, device, grids=grids, markers=self._markers
-            )
+            self._states = WarpStates(self.composed, num_envs, self.engine, device, grids=grids, markers=self._markers)
         else:
             pads = partial(WORLD_PADS.config_class(name), physics=self.physics, coupling=self.coupling, device=device)
             self._states = CStates(self.composed, num_envs, pads)

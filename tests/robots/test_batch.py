@@ -13,7 +13,7 @@ from raytac.robots.ik import PoseServo
 from raytac.robots.impedance import JointImpedance
 from raytac.robots.panda import MAX_VELOCITY, READY, two_finger_panda
 from raytac.robots.pose_errors import PoseErrors
-from raytac.robots.states import ControlWriter, StateReader, body_pose, numbers, site_pose
+from raytac.robots.states import NumberWriter, StateReader, body_pose, numbers, site_pose
 from raytac.se3 import pose_error, rotations
 
 MIXED = """<mujoco><worldbody><body name="a"><joint name="h" axis="0 1 0.2"/><geom size=".1" pos=".2 0 .1"/>
@@ -86,11 +86,11 @@ def test_numbers_are_those_that_mujoco_has_now() -> None:
 
 def test_controls_are_written_for_those_that_are_named_and_none_that_are_not_finite() -> None:
     _, datas = mixed(3)
-    writer = ControlWriter(datas, [3, 0])
-    writer.controls.numpy()[:] = np.arange(6.0).reshape(3, 2) + 1.0
+    writer = NumberWriter(datas, "ctrl", [3, 0])
+    writer.array.numpy()[:] = np.arange(6.0).reshape(3, 2) + 1.0
     assert writer.write(np.array([0, 2])) is None
     assert [data.ctrl.tolist() for data in datas] == [[2.0, 0, 0, 1.0], [0, 0, 0, 0], [6.0, 0, 0, 5.0]]
-    writer.controls.numpy()[1] = np.nan
+    writer.array.numpy()[1] = np.nan
     wrong = writer.write([0, 1, 2])
     assert wrong is not None and np.isnan(wrong).all() and (datas[1].ctrl == 0.0).all()
     assert writer.write([2]) is None, "the first two are not asked for"

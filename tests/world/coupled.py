@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+import warp as wp
 
 from raytac.physics.soft.bodies import SceneBody, ScenePad
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
 from raytac.physics.soft.scene import SoftScene
 from raytac.specs import load_sensor
-from raytac.world.coupling import Coupling, coupling_inputs
+from raytac.world.c_coupling import CCoupling
+from raytac.world.coupling_inputs import CouplingInputs
 
 SENSOR = load_sensor("gelsight_mini")
 MESH = pad_mesh(SENSOR.gelpad, PadLevel(3e-3, 2, 1.5, 1.5, 5e-5))
@@ -23,6 +26,42 @@ def pose(rotation=None, position=(0.0, 0.0, 0.0)) -> np.ndarray:
         matrix[:3, :3] = rotation
     matrix[:3, 3] = position
     return matrix
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A contact as ``set_interval`` writes it; ``side`` and ``other`` as of ``coupling_kernels.Contacts``."""
+
+    side: int
+    stiffness: np.ndarray
+    place: np.ndarray
+    other: int = -1
+    normal: np.ndarray | None = None
+    """None: never opens."""
+    wrench: np.ndarray | None = None
+    """None: ``normal`` alone."""
+
+
+def set_interval(
+    coupling: CCoupling, wrench: np.ndarray, contacts: Sequence[Contact] = (), bodies: Sequence[Mapping[str, object]] = ()
+) -> None:
+    """Begin an interval of the only environment with these contacts and bodies of the solver."""
+    law = coupling.law
+    law.wrench.numpy()[0], law.contacts.count.numpy()[0] = wrench, len(contacts)
+    fields = {
+        name: getattr(law.contacts, name).numpy()[0]
+        for name in ("side", "stiffness", "place", "normal", "opens", "force", "torque")
+    }
+    for k, one in enumerate(contacts):
+        normal = np.zeros(3) if one.normal is None else one.normal
+        share = np.append(normal, np.zeros(3)) if one.wrench is None else one.wrench
+        fields["side"][k], fields["stiffness"][k], fields["place"][k] = (one.side, one.other), one.stiffness, one.place
+        fields["opens"][k], fields["normal"][k] = one.normal is not None, normal
+        fields["force"][k], fields["torque"][k] = share[:3], share[3:]
+    for s, body in enumerate(bodies):
+        for name, value in body.items():
+            getattr(law.solver_bodies, name).numpy()[0, s] = value
+    coupling.update([0])
 
 
 class Coupled:
@@ -51,7 +90,9 @@ class Coupled:
         self.scene = SoftScene(
             [ScenePad(name, SENSOR, MESH, 0.2e-3) for name in pads], bodies, self.cases(), places, gravity=gravity, dt=interval
         )
-        self.coupling = Coupling(self.model, list(self.links.values()))
+        self.inputs = CouplingInputs(self.scene, list(self.links))
+        room = {"contacts": self.inputs.contacts, "solver_bodies": self.inputs.solver_bodies}
+        self.coupling = CCoupling([self.model], [self.data], list(self.links.values()), **room)
         self.wrench = np.zeros((len(self.links), 6))
 
     def at(self, name: str) -> np.ndarray:
@@ -70,7 +111,7 @@ class Coupled:
                 mujoco.mj_step1(self.model, self.data)
                 if control is not None:
                     control(self.data)
-                self.coupling.apply(self.data, 0)
+                self.coupling.apply([0])
                 mujoco.mj_step2(self.model, self.data)
                 mujoco.mj_kinematics(self.model, self.data)
                 if k == per or not self.scene.is_small(self.cases(), self._led()):
@@ -79,10 +120,13 @@ class Coupled:
             mujoco.mj_comPos(self.model, self.data)
             report = self.scene.step(self.cases(), self._led(), dt=k * h)
             assert not report.failed[0] and report.min_gap[0] > 0.0 and report.min_det[0] > 0.0
-            wrench, contacts, bodies = coupling_inputs(self.scene, self.links)[0]
-            self.wrench = wrench
-            if self.two_way:
-                self.coupling.update(self.data, 0, wrench, contacts if self.law else [], bodies if self.law else {})
+            self.inputs.gather(self.coupling.law, wp.ones(1, dtype=wp.int32, device="cpu"))
+            self.wrench = self.coupling.law.wrench.numpy()[0].copy()
+            if not self.law or not self.two_way:
+                self.coupling.law.contacts.count.zero_()
+            if not self.two_way:
+                self.coupling.law.wrench.zero_()
+            self.coupling.update([0])
             mujoco.mj_energyPos(self.model, self.data)
             mujoco.mj_energyVel(self.model, self.data)
             energies.append(float(self.data.energy.sum() + report.elastic[0] + report.barrier[0]))

@@ -9,8 +9,8 @@ import pytest
 from raytac.errors import InputError
 from raytac.physics.soft.bodies import scene_body
 from raytac.shapes.part import primitive
-from raytac.world.coupling import CoupledContact, Coupling, SolverBody
-from tests.world.coupled import Coupled, pose
+from raytac.world.c_coupling import CCoupling
+from tests.world.coupled import Contact, Coupled, pose, set_interval
 
 G = 9.81
 SLIDER = """<mujoco><option timestep="{h}" gravity="0 0 {g}" integrator="implicitfast"/><worldbody><body name="finger" pos="0 0 {z}"
@@ -27,7 +27,7 @@ def on_a_spring(mass, k, factor, *, h=1e-3, interval=1e-2, height=-1e-5, seconds
     data = mujoco.MjData(model)
     data.qpos[0] = -height
     mujoco.mj_forward(model, data)
-    coupling, energy, places = Coupling(model, [1]), [], []
+    coupling, energy, places = CCoupling([model], [data], [1], contacts=1), [], []
     for _ in range(round(seconds / interval)):
         x = -float(data.qpos[0])
         w = np.zeros((1, 6))
@@ -35,13 +35,13 @@ def on_a_spring(mass, k, factor, *, h=1e-3, interval=1e-2, height=-1e-5, seconds
         bound = np.zeros((6, 6))
         bound[2, 2] = factor * k
         push = np.array([0.0, 0.0, w[0, 2]])
-        contacts = [CoupledContact(1, bound, data.xpos[1].copy(), None, push)] if x < 0.0 and factor else []
-        coupling.update(data, 0, w, contacts)
+        contacts = [Contact(0, bound, data.xpos[1].copy(), normal=push)] if x < 0.0 and factor else []
+        set_interval(coupling, w, contacts)
         energy.append(0.5 * mass * data.qvel[0] ** 2 + mass * G * x + 0.5 * k * max(-x, 0.0) ** 2)
         places.append(x)
         for _ in range(round(interval / h)):
             mujoco.mj_step1(model, data)
-            coupling.apply(data, 0)
+            coupling.apply([0])
             mujoco.mj_step2(model, data)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
@@ -75,15 +75,13 @@ def test_a_stand_in_comes_along_as_the_true_body_would():
     model = mujoco.MjModel.from_xml_string(SLIDER.format(h=1e-3, g=0.0, z=0.0, m=0.1, drive='<motor joint="z"/>'))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    coupling = Coupling(model, [1])
-    partner = SolverBody(0.3, 1e-5 * np.eye(3), np.zeros(3), np.zeros(6), np.zeros(6))
-    coupling.update(
-        data, 0, np.zeros((1, 6)), [CoupledContact(1, np.diag([1e5] * 3 + [10.0] * 3), np.zeros(3), "cube")], {"cube": partner}
-    )
+    coupling = CCoupling([model], [data], [1], contacts=1, solver_bodies=1)
+    partner = {"mass": 0.3, "inertia": 1e-5 * np.eye(3)}
+    set_interval(coupling, np.zeros((1, 6)), [Contact(0, np.diag([1e5] * 3 + [10.0] * 3), np.zeros(3), -2)], [partner])
     for _ in range(100):
         mujoco.mj_step1(model, data)
         data.ctrl[0] = 0.4
-        coupling.apply(data, 0)
+        coupling.apply([0])
         mujoco.mj_step2(model, data)
     assert data.qvel[0] == pytest.approx(0.4 / 0.4 * 0.1, rel=1e-3)
 
@@ -94,12 +92,12 @@ def test_a_contact_opens_instead_of_pulling():
     data.qvel[0] = -1.0  # upwards: the joint's axis is the pad's, which looks down
     mujoco.mj_forward(model, data)
     before = data.qvel[0]
-    coupling = Coupling(model, [1])
+    coupling = CCoupling([model], [data], [1], contacts=1)
     w = np.array([[0.0, 0.0, 2.0, 0.0, 0.0, 0.0]])
-    coupling.update(data, 0, w, [CoupledContact(1, np.diag([1e5] * 3 + [0.0] * 3), np.zeros(3), None, w[0, :3])])
+    set_interval(coupling, w, [Contact(0, np.diag([1e5] * 3 + [0.0] * 3), np.zeros(3), normal=w[0, :3])])
     for _ in range(10):
         mujoco.mj_step1(model, data)
-        coupling.apply(data, 0)
+        coupling.apply([0])
         mujoco.mj_step2(model, data)
     assert abs(data.qvel[0] - before) < 1e-9 and np.abs(data.xfrc_applied[1]).max() < 1e-12
 
@@ -110,18 +108,18 @@ def test_an_open_contact_takes_its_friction_and_torque_with_it():
     data = mujoco.MjData(model)
     data.qvel[0] = -1.0  # upwards
     mujoco.mj_forward(model, data)
-    coupling = Coupling(model, [1])
+    coupling = CCoupling([model], [data], [1], contacts=2)
     at, origin = np.array([2e-3, 0.0, 0.0]), data.xpos[1]
     opening, staying = np.array([0.4, -0.3, 2.0, 1e-3, 0.0, 2e-3]), np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
     about_origin = np.append(opening[:3], opening[3:] + np.cross(at - origin, opening[:3]))
     weak = np.diag([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0])  # so soft that it does not open
     contacts = [
-        CoupledContact(1, np.diag([1e5] * 3 + [0.0] * 3), at, None, opening[:3], opening),
-        CoupledContact(1, weak, origin.copy(), None, staying[:3], staying),
+        Contact(0, np.diag([1e5] * 3 + [0.0] * 3), at, normal=opening[:3], wrench=opening),
+        Contact(0, weak, origin.copy(), normal=staying[:3], wrench=staying),
     ]
-    coupling.update(data, 0, (about_origin + staying)[None], contacts)
+    set_interval(coupling, (about_origin + staying)[None], contacts)
     mujoco.mj_step1(model, data)
-    coupling.apply(data, 0)
+    coupling.apply([0])
     left = data.xfrc_applied[1].copy()  # about the centre of mass
     left[3:] += np.cross(data.xipos[1] - data.xpos[1], left[:3])
     np.testing.assert_allclose(left, staying, atol=1e-4)
@@ -209,10 +207,6 @@ def test_what_cannot_be_coupled_is_named():
     model = mujoco.MjModel.from_xml_string(SLIDER.format(h=1e-3, g=0.0, z=0.0, m=0.1, drive=""))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    with pytest.raises(InputError, match=r"bodies = \[0\]"):
-        Coupling(model, [0])
-    coupling = Coupling(model, [1])
-    with pytest.raises(InputError, match="wrench"):
-        coupling.update(data, 0, np.full((1, 6), np.nan))
-    with pytest.raises(InputError, match=r"contacts = 'ball'"):
-        coupling.update(data, 0, np.zeros((1, 6)), [CoupledContact(1, np.eye(6), np.zeros(3), "ball")])
+    for bodies in ([0], [1, 1], [7]):
+        with pytest.raises(InputError, match=r"bodies = .*different bodies of the model"):
+            CCoupling([model], [data], bodies, contacts=1)

@@ -11,7 +11,7 @@ from ipc.bodies import rotation_matrix
 from ipc.solver.patch_motion import RestPatches
 from raytac.physics.soft.bodies import scene_body
 from raytac.shapes.part import primitive
-from raytac.world.coupling import STIFFENING
+from raytac.world.coupling_inputs import STIFFENING
 from tests.world.coupled import Coupled, pose
 from tests.world.test_coupling import SLIDER
 

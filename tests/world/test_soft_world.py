@@ -179,14 +179,16 @@ def test_forces_that_are_not_finite_fail_their_own_environment(monkeypatch: pyte
     gripper = RobotSpec("floating_gripper", opening=0.0102)
     cube = BodySpec("cube", "box", {"length": 0.01, "width": 0.01, "height": 0.01}, mass=0.02)
     scene = TaskScene("grip", gripper, (cube,), physics="ipc", gravity=(0.0, 0.0, 0.0), coupling="two_way")
-    world, wrench = TactileWorld(scene, outputs=("wrench",), num_envs=2), SoftScene.wrench
+    world, step = TactileWorld(scene, outputs=("wrench",), num_envs=2), SoftScene.step
 
-    def spoilt(soft: SoftScene, name: str) -> np.ndarray:
-        found = wrench(soft, name)
-        found[0] = np.nan
-        return found
+    def spoilt(soft: SoftScene, *args: Any) -> SceneReport:
+        report, host = step(soft, *args), soft.world.sums.host
+        force = host["force"].copy()
+        force[0] = np.nan
+        host["force"] = force
+        return report
 
-    monkeypatch.setattr(SoftScene, "wrench", spoilt)
+    monkeypatch.setattr(SoftScene, "step", spoilt)
     assert world.step().failed.tolist() == [True, False]
 
 

@@ -129,26 +129,40 @@ _SHEAR_MARGIN = 1.2
 def pad_stiffness(gelpad: GelpadSpec, area: float) -> np.ndarray:
     """Upper bound (6, 6) of the stiffness of a rigid contact of ``area`` [m²], pad axes.
 
-    About its centre: diagonal, [N/m], [N m/rad].
+    About its centre: diagonal, [N/m], [N m/rad]; see ``pad_stiffness_terms``.
+    """
+    a = float(np.sqrt(area / np.pi))
+    tangent, normal, rocking, twist = (pad_stiffness_terms(gelpad) * a ** np.array(STIFFNESS_POWERS)).sum(axis=1)
+    return np.diag([tangent, tangent, normal, rocking, rocking, twist])
 
-    The sum of two limits of a rigid flat punch of the same area, a = √(area/π), on a bonded layer of thickness t: one much wider than the
-    layer (all strain confined: modulus M = E (1 − ν) / ((1 + ν)(1 − 2ν)), shear modulus G over the height t) and one much narrower
-    (half-space; K. L. Johnson, *Contact Mechanics*, 1985, for normal, tangential and twisting displacement; a rocking punch).
+
+STIFFNESS_POWERS = ((1, 2), (1, 2), (3, 4), (3, 4))
+"""Powers of the radius of contact in ``pad_stiffness_terms``, (4, 2)."""
+
+
+def pad_stiffness_terms(gelpad: GelpadSpec) -> np.ndarray:
+    """Bound of a contact's stiffness as two powers of its radius a = √(area/π).
+
+    Coefficients (4, 2).
+
+    Rows are tangential, normal, rocking and twisting motion; the powers of a are ``STIFFNESS_POWERS``. It is the sum of two limits of a
+    rigid flat punch of the same area on a bonded layer of thickness t: one much narrower than the layer (half-space; K. L. Johnson,
+    *Contact Mechanics*, 1985, for normal, tangential and twisting displacement; a rocking punch) and one much wider (all strain
+    confined: modulus M = E (1 − ν) / ((1 + ν)(1 − 2ν)), shear modulus G over the height t).
 
     ======== ====================== ===============
     motion   narrow                 wide
     ======== ====================== ===============
-    normal   2 a E / (1 − ν²)       M A / t
-    tangent  8 a G / (2 − ν)        G A / t
+    normal   2 a E / (1 − ν²)       M π a² / t
+    tangent  8 a G / (2 − ν)        G π a² / t
     rocking  4/3 a³ E / (1 − ν²)    M π a⁴ / (4 t)
     twist    16/3 G a³              G π a⁴ / (2 t)
     ======== ====================== ===============
     """
     e, nu, t = gelpad.youngs_modulus, gelpad.poisson_ratio, gelpad.thickness
     shear, confined, plane = e / (2.0 * (1.0 + nu)), e * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu)), e / (1.0 - nu**2)
-    a = float(np.sqrt(area / np.pi))
-    normal = 2.0 * a * plane + confined * area / t
-    tangent = _SHEAR_MARGIN * (8.0 * a * shear / (2.0 - nu) + shear * area / t)
-    rocking = 4.0 / 3.0 * a**3 * plane + confined * np.pi * a**4 / (4.0 * t)
-    twist = _SHEAR_MARGIN * (16.0 / 3.0 * shear * a**3 + shear * np.pi * a**4 / (2.0 * t))
-    return np.diag([tangent, tangent, normal, rocking, rocking, twist])
+    tangent = _SHEAR_MARGIN * 8.0 * shear / (2.0 - nu), _SHEAR_MARGIN * shear * np.pi / t
+    normal = 2.0 * plane, confined * np.pi / t
+    rocking = 4.0 / 3.0 * plane, confined * np.pi / (4.0 * t)
+    twist = _SHEAR_MARGIN * 16.0 / 3.0 * shear, _SHEAR_MARGIN * shear * np.pi / (2.0 * t)
+    return np.array([tangent, normal, rocking, twist])

@@ -264,30 +264,25 @@ class SoftScene:
     def stiffness(self, pad: str) -> np.ndarray:
         """Upper bound of a pad's contact stiffness (B, 6, 6), world axes (``pad_stiffness``)."""
         gelpad = self._registry.pad(pad).sensor.gelpad
-        index = self.world.layout.names.index(pad)
-        first, last = self.world.layout.vert_start[index : index + 2]
-        loaded = np.linalg.norm(self.world.contact_forces(pad), axis=2) > 0.0
-        areas = (loaded * self.world.layout.vert_area[first:last]).sum(axis=1)
+        sums, index = self.world.sums.host, self.world.layout.names.index(pad)
         rotation = np.zeros((self.num_envs, 6, 6))
-        rotation[:, :3, :3] = rotation[:, 3:, 3:] = self.world.frame(pad)[0]
-        local = np.stack([pad_stiffness(gelpad, float(area)) for area in areas])
+        rotation[:, :3, :3] = rotation[:, 3:, 3:] = sums["rotation"][:, index]
+        local = np.stack([pad_stiffness(gelpad, float(area)) for area in sums["area"][:, index]])
         return rotation @ local @ np.swapaxes(rotation, 1, 2)
 
     def pose(self, name: str) -> np.ndarray:
         """``world_from_body`` or ``world_from_pad`` (B, 4, 4); the best rigid fit of a soft body."""
         pose = np.tile(np.eye(4), (self.num_envs, 1, 1))
         body = None if name in self.pads else self._registry.body(name)
-        if body is None or body.is_driven:
-            pose[:, :3, :3], pose[:, :3, 3] = self.world.frame(name)
-        elif isinstance(body.solid, ipc.SoftBody):
+        if body is not None and not body.is_driven and isinstance(body.solid, ipc.SoftBody):
             rest = body.solid.mesh.vertices
             now = self.world.positions(name)
             mean, rest_mean = now.mean(axis=1), rest.mean(axis=0)
             pose[:, :3, :3] = nearest_rotation(np.einsum("bni,nj->bij", now - mean[:, None], rest - rest_mean))
             pose[:, :3, 3] = mean - pose[:, :3, :3] @ rest_mean
         else:
-            matrix, position = self.world.affine_pose(name)
-            pose[:, :3, :3], pose[:, :3, 3] = nearest_rotation(matrix), position
+            sums, index = self.world.sums.host, self.world.layout.names.index(name)
+            pose[:, :3, :3], pose[:, :3, 3] = sums["rotation"][:, index], sums["position"][:, index]
         return pose
 
     def velocity(self, name: str) -> np.ndarray:
@@ -400,9 +395,10 @@ class SoftScene:
         if name in self.bodies and isinstance(self.bodies[name].solid, ipc.HalfSpace):
             wrench = self.world.wrench(name)
             return np.concatenate([wrench.force, wrench.torque], axis=1)
-        forces = self.world.contact_forces(name)
-        arm = self.mesh(name)[0] - self.pose(name)[:, None, :3, 3]
-        return np.concatenate([forces.sum(axis=1), np.cross(arm, forces).sum(axis=1)], axis=1)
+        sums, index = self.world.sums.host, self.world.layout.names.index(name)
+        force, torque = sums["force"][:, index], sums["torque"][:, index]
+        away = sums["position"][:, index] - self.pose(name)[:, :3, 3]  # of a free soft body the sums are about the world's origin
+        return np.concatenate([force, torque + np.cross(away, force)], axis=1)
 
     def _surface_numbers(self, pad: ScenePad) -> np.ndarray:
         """Number of each coat vertex among the solver's surface vertices."""

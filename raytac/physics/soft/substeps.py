@@ -108,10 +108,10 @@ class Substeps:
 
     def motions(self, now: Poses, goal: Poses, remaining: np.ndarray) -> dict[str, BoxMotion]:
         """Motions to ``goal``; free bodies keep their velocity for ``remaining`` (B,) [s]."""
-        motions = {}
+        motions, sums = {}, self._query.world.sums.host
         for k, (name, pad) in enumerate(self._pads.items()):
-            rest, vertices = pad.mesh.tets.vertices, self._query.world.positions(name, frame="body")
-            low, high = np.minimum(rest.min(axis=0), vertices.min(axis=1)), np.maximum(rest.max(axis=0), vertices.max(axis=1))
+            rest, index = pad.mesh.tets.vertices, self._query.world.layout.names.index(name)
+            low, high = np.minimum(rest.min(axis=0), sums["low"][:, index]), np.maximum(rest.max(axis=0), sums["high"][:, index])
             motions[name] = BoxMotion(now.pads[:, k], goal.pads[:, k], low, high)
         for name, body in self._bodies.items():
             motions[name] = self._body_motion(body, now.bodies, goal.bodies, remaining)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from raytac.robots.states import Numbers
@@ -33,6 +34,7 @@ class NumberReader:
             stride += [width] * width
             shapes[key] = size, (num_envs, *one.shape)
             size += num_envs * width
+        self._shapes = shapes
         self._flat = wp.zeros(size, dtype=wp.float64, device=device)
         first = int(self._flat.ptr or 0)
         self.arrays: dict[str, wp.array] = {
@@ -46,6 +48,11 @@ class NumberReader:
             setattr(entries, name, wp.array(column, dtype=wp.int32, device=device))
         entries.values = self._flat
         self._launch = partial(wp.launch, kernels.read_numbers, dim=(num_envs, len(index)), inputs=[entries], device=device)
+
+    def host(self) -> dict[str, np.ndarray]:
+        """NumPy arrays by name of what was read last, of one copy; it waits for the device."""
+        flat = np.array(self._flat.numpy())
+        return {key: flat[at : at + int(np.prod(shape))].reshape(shape) for key, (at, shape) in self._shapes.items()}
 
     def read(self) -> None:
         """Copy all numbers to ``arrays``."""
