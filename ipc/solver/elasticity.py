@@ -381,6 +381,7 @@ def add_block(
     model: wp.int32,
     mu: wp.float64,
     f: wp.vec4d,
+    volume: wp.float64,
     F: wp.mat33d,
     env: wp.int32,
     blocks: MatArray2d,
@@ -391,15 +392,24 @@ def add_block(
     """
     even, odd = even_part(model, mu, f, p.g, q.g, p.b, q.b, p.c, q.c), odd_part(model, f, F, p.g, q.g)
     if place >= 0:
-        blocks[env, place] = blocks[env, place] + (even + odd)
+        blocks[env, place] = blocks[env, place] + volume * (even + odd)
     else:
-        blocks[env, -1 - place] = blocks[env, -1 - place] + (wp.transpose(even) - odd)
+        blocks[env, -1 - place] = blocks[env, -1 - place] + volume * wp.transpose(even + odd)
 
 
 @wp.func
-def add_diagonal(place: wp.int32, p: Corner, model: wp.int32, mu: wp.float64, f: wp.vec4d, env: wp.int32, blocks: MatArray2d):
+def add_diagonal(
+    place: wp.int32,
+    p: Corner,
+    model: wp.int32,
+    mu: wp.float64,
+    f: wp.vec4d,
+    volume: wp.float64,
+    env: wp.int32,
+    blocks: MatArray2d,
+):
     """The same of one corner."""
-    blocks[env, place] = blocks[env, place] + even_part(model, mu, f, p.g, p.g, p.b, p.b, p.c, p.c)
+    blocks[env, place] = blocks[env, place] + volume * even_part(model, mu, f, p.g, p.g, p.b, p.b, p.c, p.c)
 
 
 @wp.kernel
@@ -422,22 +432,22 @@ def add_element_blocks(
     if active[env] == 0:
         return
     model, volume = elements.model[e] + 0, elements.volume[e] + wp.float64(0.0)
-    mu = volume * elements.mu[e]
-    f = volume * el_mckl[env, e]
+    mu = elements.mu[e] + wp.float64(0.0)
+    f = el_mckl[env, e] + wp.vec4d()
     F = el_F[env, e] + wp.mat33d()
     C = cofactor(F)
     p0, p1 = corner_of(elements, e, 0, F, C), corner_of(elements, e, 1, F, C)
     p2, p3 = corner_of(elements, e, 2, F, C), corner_of(elements, e, 3, F, C)
-    add_diagonal(places[e, 0], p0, model, mu, f, env, blocks)
-    add_diagonal(places[e, 1], p1, model, mu, f, env, blocks)
-    add_diagonal(places[e, 2], p2, model, mu, f, env, blocks)
-    add_diagonal(places[e, 3], p3, model, mu, f, env, blocks)
-    add_block(places[e, 4], p0, p1, model, mu, f, F, env, blocks)
-    add_block(places[e, 5], p0, p2, model, mu, f, F, env, blocks)
-    add_block(places[e, 6], p0, p3, model, mu, f, F, env, blocks)
-    add_block(places[e, 7], p1, p2, model, mu, f, F, env, blocks)
-    add_block(places[e, 8], p1, p3, model, mu, f, F, env, blocks)
-    add_block(places[e, 9], p2, p3, model, mu, f, F, env, blocks)
+    add_diagonal(places[e, 0], p0, model, mu, f, volume, env, blocks)
+    add_diagonal(places[e, 1], p1, model, mu, f, volume, env, blocks)
+    add_diagonal(places[e, 2], p2, model, mu, f, volume, env, blocks)
+    add_diagonal(places[e, 3], p3, model, mu, f, volume, env, blocks)
+    add_block(places[e, 4], p0, p1, model, mu, f, volume, F, env, blocks)
+    add_block(places[e, 5], p0, p2, model, mu, f, volume, F, env, blocks)
+    add_block(places[e, 6], p0, p3, model, mu, f, volume, F, env, blocks)
+    add_block(places[e, 7], p1, p2, model, mu, f, volume, F, env, blocks)
+    add_block(places[e, 8], p1, p3, model, mu, f, volume, F, env, blocks)
+    add_block(places[e, 9], p2, p3, model, mu, f, volume, F, env, blocks)
 
 
 PAIRS = (0, 5, 10, 15, 1, 2, 3, 6, 7, 11)
