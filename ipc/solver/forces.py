@@ -35,17 +35,6 @@ class _Forces:
     force: Floats
     """[N] (C, 3)."""
 
-    def side(self, layout: Layout) -> Floats:
-        """+1 or −1 (C,): the force on the pair's first body is side · force."""
-        return np.where(layout.vert_body[self.verts[:, 0]] == layout.pairs[self.pair, 0], 1.0, -1.0)
-
-    def points(self, layout: Layout, x: Floats) -> Floats:
-        """Points of action on the pair's first body [m], (C, 3); ``x``: all vertices, (B, V, 3)."""
-        coef = self.side(layout)[:, None] * self.coef
-        weights = np.where((coef > 0.0) & (self.verts >= 0), coef, 0.0)
-        at = x[self.env[:, None], np.maximum(self.verts, 0)]
-        return np.einsum("cn,cni->ci", weights, at) / weights.sum(axis=1, keepdims=True)
-
 
 def _normal_forces(potential: Potential) -> _Forces:
     """Normal forces of the contacts at the end of the step."""

@@ -33,7 +33,7 @@ def check_imprints(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def imprint_scores(
-    models: Models, held: Models, sensor: SensorSpec, shots: Photographs, names: Sequence[str], *, level: str, device: str
+    models: Models, pad_models: Models, sensor: SensorSpec, shots: Photographs, names: Sequence[str], *, level: str, device: str
 ) -> Scores:
     """Errors of the fitted ray tracer by imprint, of presses that were not fitted.
 
@@ -41,11 +41,11 @@ def imprint_scores(
 
     Args:
         models: lights fitted with a free profile of slopes, for ``FITTED``.
-        held: lights fitted under the rigid pad's profile, for the pads: lights fitted with a free one make up for what it takes over.
+        pad_models: lights fitted under the rigid pad's profile, for the pads: lights fitted with a free one make up for what it takes over.
     """
     out: Scores = {}
     for name in names:
-        lit = models if name == FITTED else held
+        lit = models if name == FITTED else pad_models
         circles = np.column_stack([lit.circles(shots)[:, :2], shots.circles[:, 2]])
         if name == FITTED:
             drift = models.drift(shots)
@@ -53,7 +53,7 @@ def imprint_scores(
             out[f"{name}.{_MODE}"] = press_scores(sensor, images, shots)
         else:
             physics: PhysicsConfig = Rigid() if name == "rigid" else Ipc(level=level)
-            _press(out, name, held, sensor, shots, circles, physics, device)
+            _press(out, name, pad_models, sensor, shots, circles, physics, device)
     return out
 
 

@@ -1,5 +1,10 @@
 """``WarpSoftPads``: soft pads of worlds on MuJoCo Warp, whose states lie on a device."""
 
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
+# pyright: reportAttributeAccessIssue=false
+# (kernels are written in the language of Warp, which looks like Python and has other types)
+
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
@@ -12,11 +17,49 @@ import warp as wp
 from raytac.physics.configs import Ipc
 from raytac.physics.soft.scene_state import SceneReport
 from raytac.robots.states import body_pose, site_pose
-from raytac.world import warp_soft_kernels as kernels
 from raytac.world.coupling import Coupling, coupling_numbers
 from raytac.world.soft_pads import SoftPads
 from raytac.world.warp_world import WarpWorld
 from raytac.world.world_model import WorldModel
+
+wp.set_module_options({"enable_backward": False, "fast_math": False})
+
+
+@wp.kernel
+def write_wrenches(
+    bodies: wp.array(dtype=wp.int32), applied: wp.array3d(dtype=wp.float64),
+    # outputs
+    xfrc: wp.array2d(dtype=wp.spatial_vector),
+):  # fmt: skip
+    """Copy wrenches (B, n, 6) about centres of mass to ``xfrc_applied`` of ``bodies`` (n,)."""
+    env, k = wp.tid()
+    w = wp.spatial_vector()
+    for i in range(6):
+        w[i] = wp.float32(applied[env, k, i])
+    xfrc[env, bodies[k]] = w
+
+
+@wp.kernel
+def mirror_bodies(
+    chosen: wp.array(dtype=wp.int32), solver: wp.array(dtype=wp.int32), mocap: wp.array(dtype=wp.int32),
+    position: wp.array3d(dtype=wp.float64), rotation: wp.array4d(dtype=wp.float64),
+    # outputs
+    place: wp.array2d(dtype=wp.vec3), turn: wp.array2d(dtype=wp.quat),
+):  # fmt: skip
+    """Copy poses of the solver's bodies to mocap bodies, in the environments ``chosen`` (B,)."""
+    env, k = wp.tid()
+    if chosen[env] == 0:
+        return
+    body = solver[k] + 0
+    matrix, at = wp.mat33d(), wp.vec3()
+    for i in range(3):
+        at[i] = wp.float32(position[env, body, i])
+        for j in range(3):
+            matrix[i, j] = rotation[env, body, i, j]
+    q = wp.quat_from_matrix(matrix)
+    place[env, mocap[k]] = at
+    # MuJoCo's order is w, x, y, z.
+    turn[env, mocap[k]] = wp.quat(wp.float32(q[3]), wp.float32(q[0]), wp.float32(q[1]), wp.float32(q[2]))
 
 
 class WarpSoftPads(SoftPads):
@@ -121,7 +164,7 @@ class WarpSoftPads(SoftPads):
         assert self._law is not None
         xfrc = self._world.engine.data.xfrc_applied
         inputs = [self._coupled, self._law.applied, xfrc]
-        wp.launch(kernels.write_wrenches, dim=self._law.applied.shape[:2], inputs=inputs, device=xfrc.device)
+        wp.launch(write_wrenches, dim=self._law.applied.shape[:2], inputs=inputs, device=xfrc.device)
 
     def _now(self, failed: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """MuJoCo Warp's poses of cases and of its bodies; failed environments keep their last ones."""
@@ -154,7 +197,7 @@ class WarpSoftPads(SoftPads):
             sums.launch()
             poses = [sums.arrays["position"], sums.arrays["rotation"]]
             inputs = [chosen, self._solver, self._mocap, *poses, data.mocap_pos, data.mocap_quat]
-            wp.launch(kernels.mirror_bodies, dim=(len(envs), len(self._own)), inputs=inputs, device=data.qpos.device)
+            wp.launch(mirror_bodies, dim=(len(envs), len(self._own)), inputs=inputs, device=data.qpos.device)
 
     def _mask(self, envs: np.ndarray) -> wp.array:
         """A mask (B,) on the device."""

@@ -214,13 +214,13 @@ class WarpWorld:
 
         With ``controls`` (B, nu), float32, on the device the actuators have these instead.
         """
-        held = controls is None
+        holding = controls is None
         if controls is not None:
             wp.copy(self.engine.data.ctrl, controls)
-        if held in self._graphs:
-            self._graphs[held]()
+        if holding in self._graphs:
+            self._graphs[holding]()
         else:
-            self._graphs[held] = self.engine.capture(partial(self.launch, held=held))  # which runs once
+            self._graphs[holding] = self.engine.capture(partial(self.launch, holding=holding))  # which runs once
 
     def hold(self) -> None:
         """One control step in which everything is held at the start, as ``TactileWorld.hold`` does."""
@@ -256,12 +256,12 @@ class WarpWorld:
         """Launch the inverse kinematics (``PoseServo``): from the tool's targets to the joints'."""
         self._launch(servo_step, self.engine.num_envs, [self._servo])
 
-    def launch(self, *, held: bool = True) -> None:
+    def launch(self, *, holding: bool = True) -> None:
         """Launch a control step, as ``step`` records it: for a graph that does more.
 
-        ``held``: by springs, not by constant controls.
+        ``holding``: by springs, not by constant controls.
         """
-        drive = self.drive if held else _leave
+        drive = self.drive if holding else _leave
         self.engine.advance(drive, scene_steps=self._steps, launches=self._launches)
         self.engine.finish()
         self._reader.read()

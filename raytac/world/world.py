@@ -31,9 +31,9 @@ from raytac.world.c_states import CStates
 from raytac.world.compose import compose
 from raytac.world.engine.choice import WarpEngine, checked_engine
 from raytac.world.environment_models import Variation
+from raytac.world.forbidden_overlap import check_start
 from raytac.world.pads import WORLD_PADS
 from raytac.world.sensor_frames import SensorFrames
-from raytac.world.start_check import check_start
 from raytac.world.world_model import WorldModel, compiled_model, own_world_model
 from raytac.world.world_state import Control, WorldState
 
@@ -323,12 +323,12 @@ class TactileWorld:
                 contact, in the only environment, which has failed then. Of several environments the one that moves so fast is marked in
                 ``failed``, with a ``RuntimeWarning``.
         """
-        held = control is None or (callable(control) and control == self.hold)
+        holding = control is None or (callable(control) and control == self.hold)
         if not self._stepped.acquire(blocking=False):
             rule = "must be stepped by one thread at a time; each thread may have a world of its own"
             raise InputError("world", value="stepped by another thread", rule=rule)
         try:
-            self._states.step(None if held else control)
+            self._states.step(None if holding else control)
         finally:
             self._stepped.release()
         return self.state()
