@@ -73,7 +73,7 @@ class PadStepper:
             num_envs: number of states B that are stepped together.
             physics: name or configuration of rigid pads; None is ``rigid``.
             seed: of every random number.
-            settings: ``outputs``, ``markers``, ``optics``, ``resolution``, ``device`` and ``pitch`` of every sensor.
+            settings: ``outputs``, ``markers``, ``optics``, ``resolution``, ``device``, ``pitch`` and ``noise`` of every sensor.
 
         Raises:
             InputError: what ``TactileWorld`` refuses of a given model, or soft pads.

@@ -82,7 +82,7 @@ class TactileReader:
             allow_overlap, keyframe: as of ``TactileWorld``: at this start, or ``qpos0``, no gel may lie in a geom that is not touched.
             physics: name or configuration of rigid pads; None is ``rigid``.
             seed: of every random number.
-            settings: ``outputs``, ``markers``, ``optics``, ``resolution``, ``device`` and ``pitch`` of every sensor.
+            settings: ``outputs``, ``markers``, ``optics``, ``resolution``, ``device``, ``pitch`` and ``noise`` of every sensor.
 
         Raises:
             InputError: no sensor, a gel that does not collide, and what ``TactileWorld`` refuses of bodies, or soft pads.

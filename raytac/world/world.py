@@ -100,6 +100,7 @@ class TactileWorld:
         device: str = "auto",
         seed: int = 0,
         pitch: float | None = None,
+        noise: bool = False,
     ) -> None:
         """Compose the scene and put it at its start; sensors are made on first use.
 
@@ -123,7 +124,7 @@ class TactileWorld:
             engine: ``mujoco``, or ``mujoco_warp`` with all states and contacts on ``device``; a ``WarpEngine`` has the sizes of its
                 memory.
             seed: of every random number.
-            pitch: spacing of the pads' grids [m], as of ``TactileSensor``.
+            pitch, noise: spacing of the pads' grids [m], grain of images, as of ``TactileSensor``.
 
         Raises:
             InputError: a value out of its choices, bodies that overlap at the start, or a model that MuJoCo refuses. Of a model of one's
@@ -182,6 +183,7 @@ class TactileWorld:
             device=device,
             physics=self.physics,
             pitch=pitch,
+            noise=noise,
         )
         self._markers = None if markers is None else markers_config(markers)
         self.model = self.composed.model

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import pickle
 from collections.abc import Callable
 from typing import Any
@@ -13,6 +14,8 @@ import pytest
 
 from raytac import InputError, PadStepper, TactileReader, TactileWorld, mount
 from raytac.gel.traction import cell_areas
+from raytac.specs import load_sensor
+from raytac.specs.sensor import NoiseSpec
 
 BALL = '<body name="ball" pos="0 0 .0052"><freejoint/><geom size=".005" mass=".05"/></body>'
 
@@ -37,6 +40,7 @@ def world() -> TactileWorld:
         ({"markers": "fot"}, "fots"),
         ({"optics": "raytrac"}, "raytrace"),
         ({"pitch": 0.4}, "in metres"),
+        ({"noise": True}, "has no noise"),
     ],
 )
 def test_settings_of_sensors_are_checked_at_construction(
@@ -44,6 +48,22 @@ def test_settings_of_sensors_are_checked_at_construction(
 ) -> None:
     with pytest.raises(InputError, match=message):
         make(lying(collide=make is TactileReader), **settings)
+
+
+def test_images_of_a_world_have_grain_on_request() -> None:
+    """Of the variance that the file gives, in every environment another."""
+    sensor = dataclasses.replace(load_sensor("gelsight_mini_9x11"), noise=NoiseSpec((100.0,) * 3, (100.0,) * 3))
+    spec = mujoco.MjSpec.from_string(f'<mujoco><option cone="elliptic"/><worldbody>{BALL}</worldbody></mujoco>')
+    mounted = mount(spec, sensor, body="world", pose=np.eye(4))
+    clean, noisy = (
+        TactileWorld(spec, sensors=[mounted], outputs=("rgb",), resolution=(320, 240), num_envs=2, device="cpu", noise=noise)
+        .observe()["sensor"]
+        .rgb.astype(float)
+        for noise in (False, True)
+    )
+    off = noisy - clean
+    assert off.std() == pytest.approx(10.0, rel=0.1)
+    assert abs(np.corrcoef(off[0].ravel(), off[1].ravel())[0, 1]) < 0.02
 
 
 def test_nothing_to_touch_is_refused() -> None:
