@@ -86,6 +86,8 @@ def fill_blocks(
 class Fsai:
     """Warp's factorised sparse approximate inverse (Kolotilina, Yeremin 1993) as a ``Preconditioner``; the mask is not looked at."""
 
+    on_host = True
+
     def __init__(self, layout: Any, batch: int, lanes: int, device: wp.Device) -> None:
         from warp.sparse import bsr_zeros
 

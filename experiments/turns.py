@@ -21,6 +21,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -154,6 +155,7 @@ def pad(level: str) -> Iterator[Callable[[], object]]:
     from raytac.sensor import TactileSensor
     from raytac.specs import StageSpec, load_press, load_sensor
 
+    soft: dict[str, Any]
     try:
         from raytac.physics import Ipc
 

@@ -4,7 +4,7 @@ Every distance is that of t = Σ_i c_i x_i. Near a closest point the coefficient
 theorem), so ∂D/∂x_i = 2 c_i t for D = ‖t‖², whichever features are closest.
 """
 
-# pyright: reportIndexIssue=false, reportOperatorIssue=false
+# pyright: reportIndexIssue=false, reportOperatorIssue=false, reportCallIssue=false, reportArgumentType=false
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ measured anew once m exceeds ``DRIFT`` of d̂. Results are the same: only pairs 
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
+# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false, reportCallIssue=false
 
 from __future__ import annotations
 

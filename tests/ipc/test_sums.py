@@ -21,7 +21,10 @@ def rubbed(device: str) -> ipc.World:
     rotation = (np.cos(0.2), 0.0, 0.0, np.sin(0.2))
     half = 1.5e-3
     cube = ipc.AffineBody(
-        "cube", ipc.box_surface((2.0 * half,) * 3), ipc.Stiff(density=2000.0), pose=ipc.Pose((0.0, 0.0, half + 0.12e-3), rotation)
+        "cube",
+        ipc.box_surface((2.0 * half, 2.0 * half, 2.0 * half)),
+        ipc.Stiff(density=2000.0),
+        pose=ipc.Pose((0.0, 0.0, half + 0.12e-3), rotation),
     )
     lid = ipc.KinematicBody("lid", ipc.box_surface((8e-3, 8e-3, 2e-3)), ipc.Pose((0.0, 0.0, 2.0 * half + 0.24e-3 + 1e-3)))
     settings = ipc.Settings(dt=0.01, d_hat=1e-4, gravity=(0.0, 0.0, -9.81), friction=0.5)
@@ -104,5 +107,7 @@ def test_forces_between_bodies_are_in_balance() -> None:
         wrench = np.concatenate([host["force"][:, body], host["torque"][:, body]], axis=1)
         np.testing.assert_allclose(wrench[:, :3], total[name][:, :3], atol=1e-9)
         # A pair acts where its first body is touched; the second one is up to d̂ away from there.
-        loads = sum(np.linalg.norm(pair.wrench[:, :3], axis=1) for names, pair in world.pressing().items() if name in names)
+        loads = np.sum(
+            [np.linalg.norm(one.wrench[:, :3], axis=1) for names, one in world.pressing().items() if name in names], axis=0
+        )
         assert (np.linalg.norm(wrench[:, 3:] - total[name][:, 3:], axis=1) < world.d_hat * loads).all() and (loads > 0.01).all()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from raytac.optics.runtime import load_mitsuba
-from raytac.optics.trace.fast_tracer import ggx
+from raytac.optics.trace.direct import ggx
 from raytac.optics.trace.scene import coat_bsdf
 from raytac.specs.sensor import CoatSpec
 

@@ -52,7 +52,7 @@ def test_settings_of_sensors_are_checked_at_construction(
 
 def test_images_of_a_world_have_grain_on_request() -> None:
     """Of the variance that the file gives, in every environment another."""
-    sensor = dataclasses.replace(load_sensor("gelsight_mini_9x11"), noise=NoiseSpec((100.0,) * 3, (100.0,) * 3))
+    sensor = dataclasses.replace(load_sensor("gelsight_mini_9x11"), noise=NoiseSpec((100.0, 100.0, 100.0), (100.0, 100.0, 100.0)))
     spec = mujoco.MjSpec.from_string(f'<mujoco><option cone="elliptic"/><worldbody>{BALL}</worldbody></mujoco>')
     mounted = mount(spec, sensor, body="world", pose=np.eye(4))
     clean, noisy = (

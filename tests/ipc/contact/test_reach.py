@@ -1,5 +1,8 @@
 """Candidates out of reach: bounds of distances, and what is left out because of them."""
 
+# pyright: reportInvalidTypeForm=false, reportCallIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportAssignmentType=false
+
 from __future__ import annotations
 
 import numpy as np
