@@ -39,8 +39,6 @@ MOST_BYTES = 2**30
 _PARTS = 16
 """Threads that add up one entry of Cᵀ D⁻¹ r."""
 _BLOCK_BYTES = 72
-PIVOT_ROUNDING = wp.constant(wp.float64(1.0e-13))
-"""Share of its diagonal entry below which a pivot is rounding."""
 
 
 @wp.struct
@@ -205,28 +203,16 @@ def list_touching(e: Elimination, active: IntArray):
 
 
 @wp.func
-def scalar_pivot(pivot: wp.float64, diagonal: wp.float64) -> wp.float64:
-    """A pivot, or the diagonal entry that it was made from where rounding has consumed it."""
-    if pivot > PIVOT_ROUNDING * diagonal and pivot > wp.float64(0.0):
-        return pivot
-    return wp.max(wp.abs(diagonal), wp.float64(1.0e-30))
-
-
-@wp.func
 def positive_inverse(A: wp.mat33d) -> wp.mat33d:
-    """Inverse of a symmetric block by LDLᵀ; pivots that are lost in rounding are enlarged.
-
-    Each pivot is judged by its own diagonal entry: a body that rolls is softer than it stretches by 10⁶ and more.
-    """
-    one, zero = wp.float64(1.0), wp.float64(0.0)
-    d0 = scalar_pivot(A[0, 0], A[0, 0])
-    l10 = A[1, 0] / d0
-    l20 = A[2, 0] / d0
-    d1 = scalar_pivot(A[1, 1] - l10 * A[1, 0], A[1, 1])
-    l21 = (A[2, 1] - l20 * A[1, 0]) / d1
-    d2 = scalar_pivot(A[2, 2] - l20 * A[2, 0] - l21 * l21 * d1, A[2, 2])
-    L = wp.mat33d(one, zero, zero, -l10, one, zero, l10 * l21 - l20, -l21, one)
-    return wp.transpose(L) * wp.diag(wp.vec3d(one / d0, one / d1, one / d2)) * L
+    """The inverse of a block; of its mean diagonal where it is not positive definite."""
+    minor = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+    det = wp.determinant(A)
+    size = wp.trace(A) / wp.float64(3.0)
+    zero = wp.float64(0.0)
+    if A[0, 0] > zero and minor > zero and det > wp.float64(1.0e-12) * size * size * size:
+        B = wp.inverse(A)
+        return wp.float64(0.5) * (B + wp.transpose(B))
+    return (wp.float64(1.0) / wp.max(wp.abs(size), wp.float64(1.0e-30))) * wp.identity(n=3, dtype=wp.float64)
 
 
 @wp.func
