@@ -130,7 +130,7 @@ def far_figures(envs: int, device: str) -> dict[str, float]:
     import numpy as np
 
     from raytac.specs import BodySpec, RobotSpec, TaskScene
-    from raytac.world.world import TactileWorld
+    from raytac.world import TactileWorld
 
     ball = BodySpec("ball", "sphere", {"radius": 0.005}, position=(0.0, 0.0, 0.6), dynamics="fixed")
     scene = TaskScene("far", RobotSpec("fixed_sensor"), (ball,), physics="ipc")

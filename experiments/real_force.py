@@ -30,10 +30,8 @@ from raytac.checks import check_number
 from raytac.device import resolve_device
 from raytac.errors import InputError, RaytacError
 from raytac.io import CommonOptions, parse_names
-from raytac.physics import RigidPad, SoftPad
-from raytac.physics.press import PressPad
-from raytac.specs import PADS, load_sensor
-from raytac.specs.press import ObjectSpec, PressScene, StageSpec
+from raytac.physics import PressPad, RigidPad, SoftPad
+from raytac.specs import PADS, ObjectSpec, PressScene, StageSpec, load_sensor
 
 COLUMNS = "depth_mm", "force_n"
 PITCH = 0.1e-3

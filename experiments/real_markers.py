@@ -30,23 +30,15 @@ from scipy import ndimage
 
 from experiments.running import recorded, run
 from raytac import quiet_warp
-from raytac.calibrate.pressed_balls import PressedBall, pressed_balls
+from raytac.calibrate import PressedBall, pressed_balls
 from raytac.checks import check_number
 from raytac.device import resolve_device
 from raytac.errors import InputError, RaytacError
-from raytac.gel.surface import PadGrid, rest_height
-from raytac.io import CommonOptions, parse_names
-from raytac.io.images import read_png
-from raytac.markers.base import MarkersConfig
-from raytac.markers.contact_tracker import ContactTracker
-from raytac.markers.contacts import ContactCells
-from raytac.markers.pattern import camera_of
-from raytac.markers.registry import MARKERS, markers_config
-from raytac.markers.sampling import height_at
-from raytac.physics import Rigid, RigidPad, SoftPad
-from raytac.physics.base import PadReading
-from raytac.specs import PADS, SensorSpec, load_sensor
-from raytac.specs.press import ObjectSpec, PressScene, StageSpec
+from raytac.gel import PadGrid, rest_height
+from raytac.io import CommonOptions, parse_names, read_png
+from raytac.markers import MARKERS, ContactCells, ContactTracker, MarkersConfig, camera_of, height_at, markers_config
+from raytac.physics import PadReading, Rigid, RigidPad, SoftPad
+from raytac.specs import PADS, ObjectSpec, PressScene, SensorSpec, StageSpec, load_sensor
 
 PITCH = 0.1e-3
 """Spacing of the pad's nodes [m]."""

@@ -4,7 +4,9 @@ from .fit_models import fit_models as fit_models
 from .fit_models import images_of as images_of
 from .photographs import Photographs as Photographs
 from .photographs import read_photographs as read_photographs
+from .pressed_balls import PressedBall as PressedBall
 from .pressed_balls import contact_radius as contact_radius
+from .pressed_balls import pressed_balls as pressed_balls
 from .presses import RealPresses as RealPresses
 from .presses import by_press as by_press
 from .presses import read_presses as read_presses

@@ -2,6 +2,7 @@ from .arrays import npz_bytes as npz_bytes
 from .atomic import write_atomic as write_atomic
 from .folder import FolderLock as FolderLock
 from .folder import result_folder as result_folder
+from .images import read_png as read_png
 from .images import write_png as write_png
 from .images import write_sheet as write_sheet
 from .metrics import VERSIONED as VERSIONED

@@ -5,12 +5,17 @@ from .config import Fots as Fots
 from .config import FotsPublished as FotsPublished
 from .config import Superposition as Superposition
 from .config import SurfaceMarkers as SurfaceMarkers
+from .contact_tracker import ContactTracker as ContactTracker
+from .contacts import ContactCells as ContactCells
 from .contacts import Contacts as Contacts
 from .contacts import ContactSamples as ContactSamples
 from .contacts import ContactSettings as ContactSettings
+from .pattern import camera_of as camera_of
 from .perturbation import MarkerPerturbation as MarkerPerturbation
 from .registry import MARKERS as MARKERS
+from .registry import markers_config as markers_config
 from .registry import register as register
+from .sampling import height_at as height_at
 from .surface import bind_to_coat as bind_to_coat
 from .tracker import MarkerFrame as MarkerFrame
 from .tracker import MarkerTracker as MarkerTracker

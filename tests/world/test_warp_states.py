@@ -132,8 +132,6 @@ def test_what_mujoco_warp_cannot_do_is_refused_when_the_world_is_made() -> None:
         world("isaac")
     with pytest.raises(InputError, match="engine"):
         world(3)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"physics.*rigid"):
-        TactileWorld("ball_rolling", physics="ipc", engine="mujoco_warp", device="cpu")
     with pytest.raises(InputError, match="launches"):
         world(WarpEngine(launches=1))
     with pytest.raises(InputError, match="must not start beyond"):
