@@ -104,7 +104,8 @@ def extra_light(
     """The defect, and its slopes by the LEDs' places and heights.
 
     Slopes where shadows are cast and ``slopes`` is asked for. Every LED has a layer of its own, so that all move in one rendering:
-    eight more give all slopes, by central differences and without inter-reflection, which changes slowly.
+    eight more give all slopes, by central differences and without inter-reflection, which changes slowly. A step over an angle at which
+    the tracer takes more points for an LED (``optics.trace.direct``) adds the error of its quadrature to that slope.
     """
     lights: dict[int, Light] = {}
     if slopes and casts_shadows(problem.sensor, tracing.shadows):

@@ -249,7 +249,7 @@ def test_a_split_led_is_a_row_of_the_same_light(sensor: SensorSpec) -> None:
 
 def test_extra_light_follows_leds_to_first_order(sensor: SensorSpec) -> None:
     """LEDs 2 mm high move by 0.4 mm either way or lose 0.5 mm of their height: slopes tell more than half of the shadows' change."""
-    leds = tuple(dataclasses.replace(led, position=(*led.position[:2], -5.6e-3), size=(2e-3, 2e-3)) for led in sensor.lights.leds)
+    leds = tuple(dataclasses.replace(led, position=(*led.position[:2], -6e-3), size=(1e-3, 2e-3)) for led in sensor.lights.leds)
     low = with_lights(sensor, dataclasses.replace(sensor.lights, leds=leds))
     at = circles(3)
     at[:, 2] = 40

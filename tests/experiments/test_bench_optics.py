@@ -31,7 +31,8 @@ def test_quick_run_measures_everything_and_keeps_its_reference(
     numbers = {key: float(value) for key, value in metrics.items() if not isinstance(value, str)}
     assert numbers["fast.cpu.80x60.fps"] == 1.0 == numbers["fast.cpu.80x60.batch2.fps"] / 2
     assert numbers["fast.cpu.80x60.batch2.device_fps"] == 2.0 and numbers["fast.cpu.80x60.batch2.device_call_ms"] == 1000.0
-    assert numbers["fast.cpu.80x60.psnr_db"] == numbers["fast.cpu.80x60.psnr_db.sphere"] > 30
+    assert numbers["fast.cpu.80x60.psnr_db"] == numbers["fast.cpu.80x60.psnr_db.sphere"] > 27
+    # That is about the noise of a reference of 16 samples a pixel.
     # Both tracers are unbiased: four times the samples halve the error, less the reference's own noise and clipping.
     for kind in ("path", "reference"):
         one, four = (numbers[f"{kind}.cpu.80x60.spp{n}.rmse_linear"] for n in (1, 4))

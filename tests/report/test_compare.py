@@ -95,8 +95,9 @@ def test_rows_are_one_a_mode_and_say_what_was_measured(quick: Path) -> None:
             assert 0 < row[f"{region}_mae"] <= row[f"{region}_rmse"] and -1 <= row[f"{region}_ssim"] <= 1
             assert row[f"{region}_psnr"] == pytest.approx(20 * np.log10(255 / row[f"{region}_rmse"]))
     assert rows["fast"]["frame_psnr"] > rows["reference.spp4"]["frame_psnr"] > rows["path.spp4"]["frame_psnr"] > 10
-    # An unbiased mode at four times the samples has half the error, less clipping and the reference's own noise.
-    assert 0.35 < rows["path.spp4"]["frame_rmse"] / rows["path.spp1"]["frame_rmse"] < 0.75
+    # An unbiased mode at four times the samples has half the error, less the reference's own noise; paths that hit a strip by chance clip.
+    assert 0.35 < rows["reference.spp4"]["frame_rmse"] / rows["reference.spp1"]["frame_rmse"] < 0.75
+    assert 0.35 < rows["path.spp4"]["frame_rmse"] / rows["path.spp1"]["frame_rmse"] < 0.85
     # fast is far better than 32 samples a pixel can tell; 1 sample a pixel is not.
     assert rows["fast"]["at_noise"] is True and rows["path.spp1"]["at_noise"] is False
     # The peak of one and the same frame is 2.98 or 3.28 MiB from call to call, so the two have no fixed order where a frame is all.
