@@ -28,6 +28,14 @@ USERS = [
 DEEP = re.compile(r"^\s*(?:from|import) (raytac\.\w+\.[\w.]+)", re.MULTILINE)
 
 
+@pytest.mark.parametrize("name", [*PACKAGES, "ipc"])
+def test_no_public_name_is_also_that_of_a_module_beside_it(name: str) -> None:
+    """The first import of such a module would put it in the place of the name."""
+    package = importlib.import_module(name)
+    modules = {module.name for module in pkgutil.iter_modules(package.__path__) if not module.ispkg}
+    assert not modules & set(package.__all__)
+
+
 @pytest.mark.parametrize("name", PACKAGES)
 @pytest.mark.renderer
 @pytest.mark.solver

@@ -1,7 +1,6 @@
 from .arrays import ARRAYS as ARRAYS
 from .arrays import COLUMNS as COLUMNS
 from .arrays import DATASET_OUTPUTS as DATASET_OUTPUTS
-from .contact_sheet import contact_sheet as contact_sheet
 from .loader import PressDataset as PressDataset
 from .plan import DatasetPlan as DatasetPlan
 from .plan import Presses as Presses
@@ -13,3 +12,4 @@ from .run import Check as Check
 from .run import RunReport as RunReport
 from .run import render_dataset as render_dataset
 from .run import verify_dataset as verify_dataset
+from .sheet import contact_sheet as contact_sheet

@@ -12,8 +12,8 @@ import numpy as np
 
 from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.drift import settled
-from raytac.calibrate.fit_models import ALONE, MODES, Models, check_fit, fit_models, images_of, mode_times
 from raytac.calibrate.grain import measured_grain
+from raytac.calibrate.model_fits import ALONE, MODES, Models, check_fit, fit_models, images_of, mode_times
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.presses import RealPresses, Split, by_half, by_press, shallow_to_deep
 from raytac.calibrate.ray_fit import FEWEST

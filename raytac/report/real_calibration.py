@@ -11,8 +11,8 @@ import numpy as np
 
 from raytac.calibrate.direct_fit import FitSettings
 from raytac.calibrate.drift import no_drift
-from raytac.calibrate.fit_models import ALONE, SHADOW_TABLES, check_fit, fit_models, images_of
 from raytac.calibrate.grain import measured_grain
+from raytac.calibrate.model_fits import ALONE, SHADOW_TABLES, check_fit, fit_models, images_of
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.prior_choice import INNER
 from raytac.device import resolve_device

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from raytac.calibrate.fit_models import GRID_PITCH, Models, images_of
+from raytac.calibrate.ball_presses import pressed_balls
+from raytac.calibrate.model_fits import GRID_PITCH, Models, images_of
 from raytac.calibrate.photographs import Photographs
-from raytac.calibrate.pressed_balls import pressed_balls
 from raytac.checks import check_names
 from raytac.io.metrics import Metric
 from raytac.physics.base import PhysicsConfig

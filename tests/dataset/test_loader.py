@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from raytac.dataset import DatasetPlan, PressDataset, contact_sheet, render_dataset, verify_dataset
-from raytac.dataset.contact_sheet import contact_figure
+from raytac.dataset.sheet import contact_figure
 from raytac.errors import InputError
 from raytac.io.arrays import npz_bytes
 from raytac.specs import SweepSpec, load_sensor

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from raytac.calibrate.direct_fit import FitSettings
-from raytac.calibrate.fit_models import MODES, fit_models
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
+from raytac.calibrate.model_fits import MODES, fit_models
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.presses import RealPresses, by_press
 from raytac.cli import main

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from raytac.calibrate import ball_presses as balls_module
 from raytac.calibrate import circles as circle_search
-from raytac.calibrate import pressed_balls as balls_module
+from raytac.calibrate.ball_presses import EDGE, contact_radius, edge_radius, overlap_depth, pressed_balls
 from raytac.calibrate.circles import find_circles
 from raytac.calibrate.imprint import circles_on_pad
-from raytac.calibrate.pressed_balls import EDGE, contact_radius, edge_radius, overlap_depth, pressed_balls
 from raytac.calibrate.presses import RealPresses
 from raytac.gel.surface import GelSurface, make_grid
 from raytac.optics import RayTraced
