@@ -1,0 +1,102 @@
+"""Fits of LED strips: their light by other ways, strips found again wherever they lie, by the ray tracer too, and its quadrature's steps."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
+from raytac.calibrate.direct_light import led_light
+from raytac.calibrate.imprint import RIGID_PAD, PixelGeometry
+from raytac.calibrate.light_parameters import HEIGHT, LENGTH, REFERENCE_DISTANCE, LightParameters, with_parameters
+from raytac.calibrate.model_fits import raytrace_mode
+from raytac.calibrate.photographs import Photographs
+from raytac.calibrate.ray_fit import extra_light, fit_lights, refine_circles, solve_direct
+from raytac.calibrate.start import leds_at_walls
+from raytac.gel.surface import make_grid
+from raytac.optics import RayTraced
+from raytac.optics.trace.quadrature import SMALL
+from raytac.specs import LightsSpec, SensorSpec, load_sensor, with_lights
+from raytac.specs.sensor_check import validate_sensor
+from tests.calibrate.test_light_fit import RADIUS, circles, direct, traced
+from tests.optics.test_strip import PANEL, STRIP, line_irradiance, rectangle_irradiance
+
+DIRECT = RayTraced(shadows=False, bounce=False)
+SETTINGS = FitSettings(fixed=("gamma", "stray", "slope"), samples=(150, 100), prior=1.0)
+
+
+def strips(z: float, length: float = 18.0, height: float = 1.0, virtual: bool = False) -> SensorSpec:
+    """A Mini with a Lambertian coat and a strip a side at the height ``z``, sizes in mm."""
+    mini = load_sensor("gelsight_mini")
+    response = dataclasses.replace(mini.response.unshaded, gamma=1.4, black_level=(0.0, 0.0, 0.0), vignetting=(0.0, 0.0, 0.0))
+    plain = dataclasses.replace(mini, response=response, coat=dataclasses.replace(mini.coat, specular=0.0))
+    size = (length / 1e3, height / 1e3)
+    leds = (
+        dataclasses.replace(
+            led, position=(*(0.95 * c for c in led.position[:2]), z / 1e3), size=size, virtual=virtual, power=tuple(3 * p for p in led.power)
+        )
+        for led in leds_at_walls(plain, "1,1,1").leds
+    )
+    return with_lights(plain, LightsSpec(tuple(leds)))
+
+
+def rows(sensor: SensorSpec) -> LightParameters:
+    return LightParameters.of(sensor, np.full((8, 8, 3), 100.0))
+
+
+def blank(at: np.ndarray) -> Photographs:
+    return Photographs(np.full((240, 320, 3), 100.0), np.full((len(at), 240, 320, 3), 100.0), at, np.full(len(at), RADIUS))
+
+
+@pytest.mark.parametrize(
+    ("lamp", "formula"), [(STRIP, line_irradiance), (PANEL, rectangle_irradiance)], ids=["line", "rectangle"]
+)
+def test_light_of_a_strip_is_its_closed_form(lamp, formula) -> None:
+    """Within the error of three points, and no point in its middle would do."""
+    x, y = np.meshgrid(np.linspace(-8e-3, 8e-3, 9), np.linspace(-6e-3, 6e-3, 7))
+    p = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()])
+    flat = PixelGeometry(p, np.tile([[0.0], [0.0], [-1.0]], p.shape[1]))
+    plain = with_lights(strips(-6.0), LightsSpec((dataclasses.replace(lamp, layer="red"),)))
+    parameters = rows(plain)
+    found = led_light(flat, parameters.leds[0], parameters.points[0], 1.0).light
+    expected = formula(lamp, p.T)
+    np.testing.assert_allclose(found, expected, rtol=0.01)
+    small = dataclasses.replace(lamp, size=(1e-4, 1e-4))
+    middle = rows(with_lights(plain, LightsSpec((dataclasses.replace(small, layer="red"),))))
+    assert np.abs(led_light(flat, middle.leds[0], middle.points[0], 1.0).light / expected - 1).max() > 0.1
+
+
+@pytest.mark.parametrize("size", [(18.0, 1.0), (18.0, 4.0), (4.0, 6.0), (1.0, 0.5)])
+def test_direct_light_is_the_ray_tracers(size: tuple[float, float]) -> None:
+    """Without shadows and inter-reflection nothing is left to add: the same sum at the same points."""
+    sensor, at = strips(-8.0, *size), circles(3)
+    state = FitState(rows(sensor), RIGID_PAD.copy(), at)
+    problem = DirectFit(sensor, blank(at), state, FitSettings(samples=(200, 200)))
+    plain = problem.light(state.p, problem.geometry(state))
+    extra = extra_light(problem, state, make_grid(sensor.gelpad, 0.06e-3), "cpu", DIRECT)
+    assert not extra.by_led
+    for one, other in zip(extra.light.parts, plain.parts, strict=True):
+        assert np.abs(one).mean() < 0.01 * other.mean()
+
+
+@pytest.mark.parametrize(("z", "virtual"), [(-2.2, True), (-3.5, True), (-5.7, False), (-9.0, False), (-18.0, False)])
+def test_strips_anywhere_between_coat_and_board_are_found_again(z: float, virtual: bool) -> None:
+    """From 1.5 mm away and 3 mm shorter or longer: heights to 0.4 mm, lengths to 1 mm, images to a quarter of a level."""
+    true_sensor = strips(z, virtual=virtual)
+    validate_sensor(true_sensor)
+    shots, true = direct(true_sensor, circles(6))
+    offset = np.random.default_rng(8).normal(size=true.p.leds.shape) * [1.5, 1.5, 0, 0.1, 0.1, 0.3, 0, 3.0]
+    offset[:, 2] = -1.5
+    start = FitState(dataclasses.replace(true.p, leds=true.p.leds + offset), true.slopes, true.circles)
+    problem = DirectFit(true_sensor, shots, start, SETTINGS, factor=4)
+    start = problem.inside_bounds(start)
+    problem, found = solve_direct(problem, start)
+    before, after = (np.abs(problem.residuals(state)[0]).mean() for state in (start, found))
+    assert problem.points == true.p.points
+    off = np.abs(found.p.leds - true.p.leds)
+    print(z, before, after, off.round(2))
+    assert after < 0.25 < before, f"image error {before:.2f} to {after:.2f} levels"
+    assert off[:, 2].max() < 0.4 and off[:, :2].max() < 0.6 and off[:, LENGTH].max() < 1.0, off
+    validate_sensor(dataclasses.replace(true_sensor, lights=found.p.lights(true_sensor)))
