@@ -20,8 +20,18 @@ import numpy as np
 from raytac.calibrate.direct_light import ExtraLight, LedLight, Light, case_light, led_light
 from raytac.calibrate.imprint import PixelGeometry, pixel_geometry
 from raytac.calibrate.light_bounds import leds_inside
-from raytac.calibrate.light_parameters import DARKEST, HEIGHT, LENGTH, REFERENCE_DISTANCE, LightParameters, darkest, mean_power, side_ties
+from raytac.calibrate.light_parameters import (
+    DARKEST,
+    HEIGHT,
+    LENGTH,
+    REFERENCE_DISTANCE,
+    LightParameters,
+    darkest,
+    mean_power,
+    side_ties,
+)
 from raytac.calibrate.photographs import Photographs, decode, encode
+from raytac.optics.trace.quadrature import EdgePoints
 from raytac.specs import SensorSpec
 
 SIGMA = {
@@ -123,19 +133,25 @@ class DirectFit:
         self.flat_geometry = self._geometry(start, self.u, self.v, np.full(len(self.u), -1))
         self.rest_geometry = self._geometry(start, self.rest_u, self.rest_v, np.full(len(self.rest_u), -1))
         self.extra, self.shape = extra, (height, width)
-        self.points = start.p.points
+        self.points = start.p.smooth_points
         wider = np.where(shots.fully_visible, 1.0, BORDER_SIGMA)[:, None]
         self.circle_sigma = CIRCLE_SIGMA * native[0] * wider
         self.ties = side_ties(start.p, len(self.flat(start)))
         self.anchor, self.hold = self.flat(start), 0.0
 
-    def with_points_of(self, p: LightParameters) -> DirectFit:
-        """The same problem, each LED with the points that the ray tracer takes at ``p``.
+    def with_points(self, points: tuple[EdgePoints, ...]) -> DirectFit:
+        """The same problem with ``points`` on its LEDs.
 
         They stay as LEDs move, so that images are smooth in every parameter.
         """
         other = copy.copy(self)
-        other.points = p.points
+        other.points = points
+        return other
+
+    def with_fixed(self, *names: str) -> DirectFit:
+        """The same problem with further blocks of parameters that stay."""
+        other = copy.copy(self)
+        other.settings = dataclasses.replace(self.settings, fixed=(*self.settings.fixed, *names))
         return other
 
     def with_extra(self, extra: ExtraLight) -> DirectFit:
@@ -208,11 +224,11 @@ class DirectFit:
     def free(self, p: LightParameters) -> np.ndarray:
         """True for parameters that are fitted, and that images depend on, (n,)."""
         free = np.concatenate([np.full(n, name not in self.settings.fixed) for name, n in self.blocks(p)])
-        for column, seen in zip((LENGTH, HEIGHT), self._sees_sizes(), strict=True):
+        for column, seen in zip((LENGTH, HEIGHT), self.sees_sizes(), strict=True):
             free[column : p.leds.size : p.leds.shape[1]] &= seen
         return free
 
-    def _sees_sizes(self) -> tuple[np.ndarray, np.ndarray]:
+    def sees_sizes(self) -> tuple[np.ndarray, np.ndarray]:
         """True for LEDs on whose length and on whose height images depend, (L,) each.
 
         An edge has an extent for direct light if it has more than one point, and for extra light if that has its slope.
@@ -238,7 +254,7 @@ class DirectFit:
     def inside_bounds(self, state: FitState) -> FitState:
         """Every parameter moved to what a sensor accepts (``leds_inside``)."""
         p, response = state.p, state.p.response.copy()
-        length, height = self._sees_sizes()
+        length, height = self.sees_sizes()
         leds = leds_inside(self.sensor, p, lengths=length, heights=height)
         response[0], response[1:4] = np.clip(response[0], 1.0, 2.4), np.clip(response[1:4], 0, DARKEST)
         a1 = np.clip(response[4], -2.0, 0.5)
@@ -382,6 +398,9 @@ class DirectFit:
         pushed = self.at(x - 1e-9 * np.sign(slope[:size]), state.circles)
         stuck = np.abs(self.flat(self.inside_bounds(pushed)) - self.flat(pushed)) > 1e-12
         movable = np.concatenate([free & ~stuck, np.full(3 * count, settings.circles)])
+        follows = np.eye(n)
+        follows[:size, :size] = self._following(x, slope[:size], free & stuck, free & ~stuck)
+        normal, slope = follows.T @ normal @ follows, follows.T @ slope
 
         def trial(damping: float) -> FitState:
             damped = normal + np.diag(damping * np.diag(normal))
@@ -390,16 +409,32 @@ class DirectFit:
             for _ in range(ACTIVE):
                 fixed = damped[np.ix_(move, ~move)] @ change[~move]
                 change[move] = np.linalg.solve(damped[np.ix_(move, move)], -slope[move] - fixed)
-                proposed = self.at(x + change[:size], state.circles + change[size:].reshape(-1, 3))
+                moved = (follows @ change)[:size]
+                proposed = self.at(x + moved, state.circles + change[size:].reshape(-1, 3))
                 allowed = self.inside_bounds(proposed)
                 over = move[:size] & (np.abs(self.flat(allowed) - self.flat(proposed)) > 1e-12)
                 if not over.any():
                     break
                 change[:size][over] = (self.flat(allowed) - x)[over]
                 move[:size] &= ~over
+            change = follows @ change
             return self.inside_bounds(self.at(x + change[:size], state.circles + change[size:].reshape(-1, 3)))
 
         return trial
+
+    def _following(self, x: np.ndarray, slope: np.ndarray, stuck: np.ndarray, free: np.ndarray) -> np.ndarray:
+        """Motion (n, n) of all parameters by one of each that is free: the others' own, and of those ``stuck`` at a bound that moves.
+
+        What an LED reaches depends on its size and aim, and with it where its middle may lie.
+        """
+        motion, circles = np.eye(len(x)), self.start.circles
+        if not stuck.any():
+            return motion
+        beyond = x - 1e3 * STEP * np.sign(slope) * stuck
+        for k in np.flatnonzero(free[: self.start.p.leds.size]):
+            ends = [self.flat(self.inside_bounds(self.at(beyond + sign * STEP * np.eye(len(x))[k], circles))) for sign in (1, -1)]
+            motion[stuck, k] = ((ends[0] - ends[1]) / (2 * STEP))[stuck]
+        return motion
 
     def solve(self, state: FitState, iterations: int, tick: Callable[[FitState, float], None] | None = None) -> FitState:
         """Levenberg and Marquardt's method from ``state``; ``tick(state, cost)`` at accepted steps."""

@@ -98,9 +98,7 @@ def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, trac
     still = layers(GelSurface.at_rest(grid))[:, 0]
     by = REST_FACTOR * height // problem.shots.background.shape[0]
     rest = still.reshape(len(still), height // by, by, width // by, by, 3).mean((2, 4)).reshape(len(still), -1, 3)
-    # With the points that the tracer takes here: a step to other sizes changes no more than the rest.
-    direct = problem.with_points_of(p).light(p, problem.geometry(state))
-    return Light(pressed, still[:, problem.row, problem.column], rest).plus(direct, -1.0)
+    return Light(pressed, still[:, problem.row, problem.column], rest).plus(problem.light(p, problem.geometry(state)), -1.0)
 
 
 def extra_light(
@@ -125,7 +123,8 @@ def extra_light(
                     leds[:, k] = np.maximum(leds[:, k], LEAST[k])  # a size below 0 is that above
             apart = (ends[1][:, k] - ends[0][:, k])[:, None, None]
             states = [dataclasses.replace(state, p=dataclasses.replace(state.p, leds=leds)) for leds in ends]
-            below, above = (defect(problem, moved, grid, device, direct) for moved in states)
+            # With the tracer's own points, so that a step to another number of them is no slope of shadows.
+            below, above = (defect(problem.with_points(moved.p.points), moved, grid, device, direct) for moved in states)
             lights[k] = Light(*((b - a) / apart for a, b in zip(below.parts, above.parts, strict=True)))
     return ExtraLight(defect(problem, state, grid, device, tracing), state.p.leds.copy(), lights)
 
@@ -166,20 +165,20 @@ def fit_lights(
     rng, results, errors = np.random.default_rng(seed), [], []
     for k in range(starts):
         first = begin if k == 0 else brightened(problem, _perturbed(problem, begin, rng))
-        own, here = solve_direct(problem, first, report(f"direct light, start {k + 1} of {starts}"))
+        own, here = solve_direct(problem, first, FIRST, report(f"direct light, start {k + 1} of {starts}"))
         off = own.residuals(here)
         results.append((own.cost(here, off), here))
         errors.append(float(np.abs(off[0][problem.inside]).mean()))
     _, state = min(results, key=lambda pair: pair[0])
-    problem = problem.with_points_of(state.p)
+    problem = problem.with_points(state.p.smooth_points)
     grid, costs, hold = make_grid(sensor.gelpad, GRID_PITCH), [], 0.0
     if not rounds:
         costs.append(problem.cost(state, problem.residuals(state)))
     # A round's cost is known when its result has been rendered: the light that it was solved with is of first order only.
     best = problem, state
     for k in range(rounds + bool(rounds)):
-        extra = extra_light(problem, state, grid, device, tracing or RayTraced(), slopes=k < rounds)
-        problem = problem.with_points_of(state.p).with_extra(extra)
+        problem = problem.with_points(state.p.smooth_points)
+        problem = problem.with_extra(extra_light(problem, state, grid, device, tracing or RayTraced(), slopes=k < rounds))
         costs.append(problem.cost(state, problem.residuals(state)))
         if costs[-1] <= min(costs):
             best, hold = (problem, state), hold / HOLD_FACTOR
@@ -193,15 +192,18 @@ def fit_lights(
 
 
 def solve_direct(
-    problem: DirectFit, state: FitState, tick: Callable[[FitState, float], None] | None = None
+    problem: DirectFit, state: FitState, steps: int, tick: Callable[[FitState, float], None] | None = None
 ) -> tuple[DirectFit, FitState]:
     """Fit of direct light from ``state``, and the problem with the points of where it ended.
 
-    Strips that come nearer to the coat take more points, with which they are fitted once more.
+    Sizes of LEDs stay at first: a long step makes an LED high, and keeps it from where it should lie. Then all parameters are fitted, with
+    the points of where LEDs are by then.
     """
-    state = problem.solve(state, FIRST, tick)
-    own = problem.with_points_of(state.p)
-    return (own, state) if own.points == problem.points else (own, own.solve(state, FIRST, tick))
+    state = problem.with_fixed("length", "height").solve(state, steps, tick)
+    own = problem.with_points(state.p.smooth_points)
+    if own.points != problem.points or any(seen.any() for seen in own.sees_sizes()):
+        state = own.solve(state, steps, tick)
+    return own.with_points(state.p.smooth_points), state
 
 
 def _perturbed(problem: DirectFit, state: FitState, rng: np.random.Generator) -> FitState:

@@ -284,7 +284,12 @@ def test_extra_light_follows_leds_to_first_order(sensor: SensorSpec) -> None:
         assert held > 5e-5, f"column {column}: shadows must change"
         assert followed < held / 2, f"column {column} by {step}: {followed / held:.2f} of the change is missed"
     thin, thick = (
-        dataclasses.replace(state, p=dataclasses.replace(state.p, leds=np.column_stack([state.p.leds[:, :HEIGHT], [height] * 3, state.p.leds[:, LENGTH]])))
+        dataclasses.replace(
+            state,
+            p=dataclasses.replace(
+                state.p, leds=np.column_stack([state.p.leds[:, :HEIGHT], [height] * 3, state.p.leds[:, LENGTH]])
+            ),
+        )
         for height in (0.1, 0.6)
     )
     flat = extra_light(problem, thin, grid, "cpu", tracing)

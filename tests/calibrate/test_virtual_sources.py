@@ -11,7 +11,7 @@ import pytest
 from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
 from raytac.calibrate.direct_light import ExtraLight, Light
 from raytac.calibrate.light_parameters import CEILING, VIRTUAL_CEILING
-from raytac.calibrate.ray_fit import fit_lights
+from raytac.calibrate.ray_fit import fit_lights, solve_direct
 from raytac.calibrate.start import leds_at_walls, leds_in_rows
 from raytac.errors import InputError, SpecError
 from raytac.gel.surface import GelSurface, make_grid
@@ -52,7 +52,7 @@ def test_lights_anywhere_between_coat_and_board_are_found_again(mini: SensorSpec
     start = FitState(dataclasses.replace(true.p, leds=true.p.leds + offset), true.slopes, true.circles)
     problem = DirectFit(true_sensor, shots, start, dataclasses.replace(SETTINGS, prior=1.0), factor=4)
     start = problem.inside_bounds(start)
-    found = problem.solve(start, 80)
+    problem, found = solve_direct(problem, start, 80)
     before, after = (np.abs(problem.residuals(state)[0]).mean() for state in (start, found))
     assert after < 0.25 < before, f"image error {before:.2f} to {after:.2f} levels"
     off = np.abs(found.p.leds[:, :3] - true.p.leds[:, :3])
