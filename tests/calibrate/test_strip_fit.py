@@ -99,17 +99,19 @@ def test_strips_anywhere_between_coat_and_board_are_found_again(z: float, virtua
     before, after = (np.abs(problem.residuals(state)[0]).mean() for state in (start, found))
     assert problem.points == true.p.smooth_points
     off = np.abs(found.p.leds - true.p.leds)
-    print(z, before, after, off.round(2))
     assert after < 0.25 < before, f"image error {before:.2f} to {after:.2f} levels"
     assert off[:, 2].max() < 0.4 and off[:, :2].max() < 0.6 and off[:, LENGTH].max() < 1.0, off
     validate_sensor(dataclasses.replace(true_sensor, lights=found.p.lights(true_sensor)))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("shadows", "most"), [(False, 0.8), (True, 1.3)], ids=["plain", "shadows"])
-def test_the_ray_tracers_strips_are_explained(shadows: bool, most: float) -> None:
-    """Held-out presses to about a level, from strips so low at the start that they take one point across where the true ones take two."""
-    sensor = strips(-6.0, height=3.0)
+@pytest.mark.parametrize("shadows", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["plain", "shadows"])
+def test_the_ray_tracers_strips_are_explained(shadows: bool) -> None:
+    """From strips so low that they take one point across where the true ones take two: their sizes, and held-out presses.
+
+    Images of the true lights are off by rounding alone.
+    """
+    sensor = strips(-7.5, height=3.6)
+    validate_sensor(sensor)
     sensor = dataclasses.replace(sensor, optics=dataclasses.replace(sensor.optics, shadows=shadows))
     shots = traced(sensor, circles(8))
     train, test = shots.take(np.arange(6)), shots.take(np.arange(6, 8))
@@ -121,6 +123,12 @@ def test_the_ray_tracers_strips_are_explained(shadows: bool, most: float) -> Non
     fitted = fit_lights(start, train, settings=dataclasses.replace(SETTINGS, prior=30.0), starts=1, rounds=3, device="cpu")
     validate_sensor(fitted.sensor)
     at = refine_circles(fitted.sensor, test, fitted.state, device="cpu")
-    mode = raytrace_mode(fitted.sensor, np.rint(shots.background.clip(0, 255)), "cpu", RayTraced())
-    images = images_of(mode, fitted.sensor, test, at, fitted.state.slopes)
-    assert np.abs(images - test.presses)[test.distance(sensor) < 1].mean() < most
+
+    def error(lit: SensorSpec, at: np.ndarray, slopes: np.ndarray) -> float:
+        mode = raytrace_mode(lit, np.rint(shots.background.clip(0, 255)), "cpu", RayTraced())
+        return float(np.abs(images_of(mode, lit, test, at, slopes) - test.presses)[test.distance(sensor) < 1].mean())
+
+    floor, own = error(sensor, test.circles, RIGID_PAD), error(fitted.sensor, at, fitted.state.slopes)
+    off = fitted.state.p.leds - p.leds
+    print(floor, own, off.round(2), fitted.costs)
+    assert own < floor + 0.2 and np.abs(off[:, [HEIGHT, LENGTH]]).max() < 0.8
