@@ -146,7 +146,8 @@ def led_light(seen: PixelGeometry, led: np.ndarray, points: EdgePoints, referenc
     (e, f), (half, other) = (frame.edges[long], frame.edges[short]), (halves[long], halves[short])
     q = 1e-3 * led[:3, None] - seen.p
     light, by_lobe, by_other, by_foot, by_distance, by_half = np.zeros((6, len(seen.p[0])))
-    by_place, by_e, by_f, by_normal = np.zeros((4, *q.shape))
+    by_place, by_e, by_f = np.zeros((3, *q.shape))
+    by_normal = np.zeros(q.shape)
     by_aim = np.zeros((2, len(light)))
     foot = e @ q
     distance = np.sqrt(np.maximum(np.einsum("km,km->m", q, q) - foot * foot, 1e-12))

@@ -1,8 +1,8 @@
 """Parameters of a fit of lights: LEDs, glow of the case, response; and ties between LEDs.
 
-An LED has place, aim, lobe, height, length and power. A press says something only about the light that reaches it, so LEDs far from all presses
-are poorly known. Ties carry over from those nearby: LEDs of one side are of one kind, and stand mirrored about the middle of their
-wall.
+An LED has place, aim, lobe, height, length and power. A press says something only about the light that reaches it, so LEDs far from all
+presses are poorly known. Ties carry over from those nearby: LEDs of one side are of one kind, and stand mirrored about the middle of
+their wall.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Fits of LED strips: their light by other ways, strips found again wherever they lie, by the ray tracer too, and its quadrature's steps."""
+"""Fits of LED strips: light against closed forms and the ray tracer's, known strips recovered wherever they lie."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_direct_light_is_the_ray_tracers(size: tuple[float, float]) -> None:
 
 
 @pytest.mark.parametrize(("z", "virtual"), [(-2.2, True), (-3.5, True), (-5.7, False), (-9.0, False), (-18.0, False)])
-def test_strips_anywhere_between_coat_and_board_are_found_again(z: float, virtual: bool) -> None:
+def test_strips_anywhere_between_coat_and_board_are_recovered(z: float, virtual: bool) -> None:
     """From 1.5 mm away and 3 mm shorter or longer: heights to 0.4 mm, lengths to 1 mm, images to a quarter of a level."""
     true_sensor = strips(z, virtual=virtual)
     validate_sensor(true_sensor)
