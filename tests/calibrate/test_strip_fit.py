@@ -132,3 +132,22 @@ def test_the_ray_tracers_strips_are_explained(shadows: bool) -> None:
     off = fitted.state.p.leds - p.leds
     print(floor, own, off.round(2), fitted.costs)
     assert own < floor + 0.2 and np.abs(off[:, [HEIGHT, LENGTH]]).max() < 0.8
+
+
+def test_what_lies_at_a_bound_that_moves_follows() -> None:
+    """Strips that touch their ceiling and are too high: small damped steps go downhill, although the ceiling moves their middles."""
+    shots, true = direct(strips(-5.9, height=1.0), circles(5))
+    leds = true.p.leds.copy()
+    leds[:, 2], leds[:, HEIGHT] = -5.2, 3.0
+    start = FitState(dataclasses.replace(true.p, leds=leds), true.slopes, true.circles)
+    problem = DirectFit(strips(-7.5, height=3.0), shots, start, SETTINGS, factor=4)
+    state = problem.inside_bounds(start)
+    assert (state.p.leds[:, 2] < -6.4).all(), "the ceiling holds their upper edges"
+    cost = problem.cost(state, problem.residuals(state))
+    trial = problem.step(state)
+    for damping in (1e4, 1e6):
+        new = trial(damping)
+        assert problem.cost(new, problem.residuals(new)) < cost
+    small = trial(1e4)
+    lower = small.p.leds[:, HEIGHT] < state.p.leds[:, HEIGHT]
+    assert lower.any() and (small.p.leds[lower, 2] > state.p.leds[lower, 2]).all(), "a lower strip may lie higher"
