@@ -47,7 +47,9 @@ SIGMA = {
     "vignette": 0.5,
     "slope": 0.15,
 }
-"""Standard deviation of a parameter about its start [mm, rad, 1]; of powers over the start's mean."""
+"""Standard deviation of a parameter about its start [mm, rad, 1].
+
+That of powers is over the mean power of the start."""
 CIRCLE_SIGMA = np.array([1.0, 1.0, 1.5]) / 320
 """Standard deviation of a circle's x, y and radius about its label, over the image's width."""
 BORDER_SIGMA = 4.0
@@ -423,9 +425,9 @@ class DirectFit:
         return trial
 
     def _following(self, x: np.ndarray, slope: np.ndarray, stuck: np.ndarray, free: np.ndarray) -> np.ndarray:
-        """Motion (n, n) of all parameters by one of each that is free: the others' own, and of those ``stuck`` at a bound that moves.
+        """Motion (n, n) of all parameters by each that is ``free``.
 
-        What an LED reaches depends on its size and aim, and with it where its middle may lie.
+        One that is not ``stuck`` moves by its own; one at a bound moves with the bound.         What an LED reaches depends on its size and aim, and with it where its middle may lie.
         """
         motion, circles = np.eye(len(x)), self.start.circles
         if not stuck.any():

@@ -38,15 +38,15 @@ class LedLight:
     light: np.ndarray
     """D, (M,)."""
     by_led: np.ndarray
-    """By a row of ``LightParameters.leds``, (8, M): position [1/mm], azimuth and elevation [1/rad], lobe, height and length [1/mm].
-    An edge with one point has no extent."""
+    """By a row of ``LightParameters.leds``, (8, M).
+    Position [1/mm], azimuth and elevation [1/rad], lobe, height and length [1/mm]. An edge with one point has no extent."""
     by_normal: np.ndarray
     """By the point's normal, (3, M). By the point itself it is minus that by the LED's position."""
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """Axis and edges of an LED, unit vectors (3,), and their slopes by azimuth and elevation, (2, 3)."""
+    """Axis and edges of an LED, unit vectors (3,); slopes by azimuth and elevation, (2, 3)."""
 
     axis: np.ndarray
     axis_slopes: np.ndarray

@@ -1,4 +1,4 @@
-"""Where LEDs of a fit may lie, and how large they may be, for a sensor to accept them."""
+"""Bounds of LEDs of a fit: places, aims and sizes that a sensor accepts."""
 
 from __future__ import annotations
 

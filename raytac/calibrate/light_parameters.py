@@ -44,7 +44,7 @@ class LightParameters:
     template: LightsSpec
     """The light file that names and layers come from."""
     leds: np.ndarray
-    """(L, 8): x, y, z [mm], azimuth, elevation [rad], lobe, height and length of the emitting face [mm]."""
+    """(L, 8): x, y, z [mm], azimuth, elevation [rad], lobe, height and length of the face [mm]."""
     power: np.ndarray
     """(L, 3) [full scales]: diffuse light of a coat at ``REFERENCE_DISTANCE`` facing the LED."""
     glow: np.ndarray

@@ -104,9 +104,9 @@ def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, trac
 def extra_light(
     problem: DirectFit, state: FitState, grid: PadGrid, device: str, tracing: RayTraced, *, slopes: bool = True
 ) -> ExtraLight:
-    """The defect, and its slopes by the LEDs' places and sizes; that of lengths where one is extended.
+    """The defect, and its slopes by the LEDs' places and sizes.
 
-    Slopes where shadows are cast and ``slopes`` is asked for. Every LED has a layer of its own, so that all move in one rendering: eight
+    Slopes by lengths where an LED is extended; all where shadows are cast and ``slopes`` is asked for. Every LED has a layer of its own, so that all move in one rendering: eight
     or ten more give all slopes, by central differences and without inter-reflection, which changes slowly.
     """
     lights: dict[int, Light] = {}

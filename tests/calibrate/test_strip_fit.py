@@ -104,8 +104,10 @@ def test_strips_anywhere_between_coat_and_board_are_recovered(z: float, virtual:
     validate_sensor(dataclasses.replace(true_sensor, lights=found.p.lights(true_sensor)))
 
 
-@pytest.mark.parametrize("shadows", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["plain", "shadows"])
-def test_the_ray_tracers_strips_are_explained(shadows: bool) -> None:
+@pytest.mark.parametrize(
+    ("shadows", "rounds"), [(False, 3), pytest.param(True, 6, marks=pytest.mark.slow)], ids=["plain", "shadows"]
+)
+def test_the_ray_tracers_strips_are_explained(shadows: bool, rounds: int) -> None:
     """From strips so low that they take one point across where the true ones take two: their sizes, and held-out presses.
 
     Images of the true lights are off by rounding alone.
@@ -120,7 +122,7 @@ def test_the_ray_tracers_strips_are_explained(shadows: bool) -> None:
     p = rows(sensor)
     start = with_parameters(sensor, dataclasses.replace(p, leds=p.leds + offset), shots.background)
     assert {points.across for points in rows(start).points} == {1} and {points.across for points in p.points} == {2}
-    fitted = fit_lights(start, train, settings=dataclasses.replace(SETTINGS, prior=30.0), starts=1, rounds=3, device="cpu")
+    fitted = fit_lights(start, train, settings=dataclasses.replace(SETTINGS, prior=30.0), starts=1, rounds=rounds, device="cpu")
     validate_sensor(fitted.sensor)
     at = refine_circles(fitted.sensor, test, fitted.state, device="cpu")
 
