@@ -427,7 +427,8 @@ class DirectFit:
     def _following(self, x: np.ndarray, slope: np.ndarray, stuck: np.ndarray, free: np.ndarray) -> np.ndarray:
         """Motion (n, n) of all parameters by each that is ``free``.
 
-        One that is not ``stuck`` moves by its own; one at a bound moves with the bound.         What an LED reaches depends on its size and aim, and with it where its middle may lie.
+        All move by their own change, and those ``stuck`` at a bound with it: what an LED reaches depends on its size and aim, and with that
+        the places where its middle may lie.
         """
         motion, circles = np.eye(len(x)), self.start.circles
         if not stuck.any():

@@ -106,8 +106,9 @@ def extra_light(
 ) -> ExtraLight:
     """The defect, and its slopes by the LEDs' places and sizes.
 
-    Slopes by lengths where an LED is extended; all where shadows are cast and ``slopes`` is asked for. Every LED has a layer of its own, so that all move in one rendering: eight
-    or ten more give all slopes, by central differences and without inter-reflection, which changes slowly.
+    Slopes by lengths where an LED is extended; all where shadows are cast and ``slopes`` is asked for. Every LED has a layer of its own,
+    so that all move in one rendering: eight or ten more give all slopes, by central differences and without inter-reflection, which
+    changes slowly.
     """
     lights: dict[int, Light] = {}
     if slopes and casts_shadows(problem.sensor, tracing.shadows):
