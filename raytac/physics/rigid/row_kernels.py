@@ -236,7 +236,6 @@ def set_rows(
             spreads[k], _LEAST
         )
         k += 1
-    slots.arm[i, pad, body] = rotation * arm
     slots.lift[i, pad, body] = lift
     slots.force[i, pad, body, 0] = spring.force - lift
     slots.force[i, pad, body, 1] = -(cos * pull[0] + sin * pull[1])
