@@ -101,7 +101,7 @@ def test_a_cube_that_slips_out_of_a_grip_does_not_spin(friction: float, across: 
     for _ in range(3):
         press(world, (across, across, 1.1 * bound), 1)
         assert np.abs(world.data[0].qvel[-3:]).max() < 0.2
-    assert world.data[0].qvel[-4] > 0.2, "it slips along z"
+    assert world.data[0].qvel[-4] > 0.1, "it slips along z"
 
 
 @pytest.mark.parametrize("garbage", [np.nan, 1e5])

@@ -140,7 +140,12 @@ class GelContact:
             search.reserve(search.pairs)
 
     def expect_lifts(self, solves: int, nv: int) -> None:
-        """Make room for ``lifts``: the most solves of MuJoCo's for them, and the model's degrees of freedom."""
+        """Make room for ``lifts``.
+
+        Args:
+            solves: most solves of MuJoCo's for them.
+            nv: degrees of freedom of the model.
+        """
         num_envs, together = self.lifts.slot.shape
         response: Any = Response()
         response.mass = self._zeros((num_envs, nv, nv), wp.float64)

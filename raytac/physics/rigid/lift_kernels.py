@@ -101,7 +101,10 @@ def lift_of(slots: Slots, i: wp.int32, slot: wp.vec2i, law: vec6d) -> wp.float64
 
 @wp.func
 def settle_contact(slots: Slots, step: wp.float64, lifts: Lifts, i: wp.int32, k: wp.int32) -> wp.float64:
-    """Solve the law of one contact under the present forces of the others; greatest change of a force [N]."""
+    """Solve the law of one contact under the present forces of the others.
+
+    Returns the greatest change of a force [N].
+    """
     slot, change = lifts.slot[i, k], wp.float64(0.0)
     pad, body = slot[0], slot[1]
     friction, first = wp.max(slots.friction[i, pad, body, 0], LEAST_FRICTION), _ROWS * k
@@ -158,7 +161,7 @@ def settle(slots: Slots, step: wp.float64, lifts: Lifts, i: wp.int32, count: wp.
 
 @wp.func
 def check_lifts(steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, i: wp.int32) -> wp.bool:
-    """Compare an environment's lifts with a solve of MuJoCo's; False if none is to be solved for.
+    """Compare lifts with a solve of MuJoCo's; False if none is to be solved for.
 
     ``steps.slides`` is cleared if all fit. After the last solve lifts that do not fit are those of the best one, unless the error fell
     well. ``velocity``: of the rows at the end of the step, by that solve.
@@ -211,7 +214,7 @@ def set_lift(slots: Slots, i: wp.int32, slot: wp.vec2i, lift: wp.float64):
 
 @wp.func
 def solve_lifts(steps: Steps, slots: Slots, lifts: Lifts, i: wp.int32, count: wp.int32):
-    """Set the lifts of an environment's first ``count`` contacts, and f₀ of their normal rows, by the law of all of them.
+    """Set the lifts of the first ``count`` contacts, and f₀ of their normal rows, by the law.
 
     ``lifts`` has the forces of a solve of MuJoCo's, after ``check_lifts``, and of ``response`` its mass and rows.
     """

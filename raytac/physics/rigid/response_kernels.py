@@ -1,4 +1,4 @@
-"""Response of an environment's velocities to forces on the rows of its gels, for small changes about a solution of MuJoCo's.
+"""Response of velocities to forces on the rows of gels, about a solution of MuJoCo's.
 
 MuJoCo's solver minimises ½ (a − a₀)ᵀ M (a − a₀) + s(J a − a*) over accelerations a. A force Δp on the gels' rows J_g, while those of
 all other constraints J_o may follow, then changes the velocities of the rows by the step's end by
@@ -51,7 +51,10 @@ class Response:
 
 @wp.func
 def add_row(response: Response, i: wp.int32, weight: wp.float64, j: wp.int32, k: wp.int32):
-    """Add ``weight`` times the outer product of the other constraint's rows ``j`` and ``k``; the lower half counts."""
+    """Add ``weight`` times the outer product of rows ``j`` and ``k`` of the other constraint.
+
+    The lower half counts.
+    """
     for m in range(response.mass.shape[1]):
         value = weight * response.other[i, j, m]
         if value != _0:
@@ -99,7 +102,10 @@ def add_cone(
 
 @wp.func
 def factorise(response: Response, i: wp.int32, count: wp.int32, step: wp.float64) -> wp.bool:
-    """L of ``mass`` and Y of the first ``count`` rows, in place; False where the mass is not positive definite."""
+    """L of ``mass`` and Y of the first ``count`` rows, in place.
+
+    Returns False where the mass is not positive definite.
+    """
     nv = response.mass.shape[1]
     for k in range(nv):
         for m in range(k, nv):

@@ -1,4 +1,4 @@
-"""Kernels on C MuJoCo's states: response of the gels' rows to forces, and lifts of slides that begin or end."""
+"""Response of gels' rows to forces, and lifts of slides, on states of C MuJoCo."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -23,7 +23,10 @@ _1 = wp.constant(wp.float64(1.0))
 
 @wp.func
 def copy_row(memory: Memory, env: wp.int32, row: wp.int32, target: wp.array3d(dtype=wp.float64), i: wp.int32, place: wp.int32):
-    """Copy a row of the constraint's Jacobian."""
+    """Copy a row of the constraint's Jacobian, which MuJoCo keeps sparse or dense.
+
+    Entries that a sparse row does not have become 0.
+    """
     jacobian = doubles(memory, env, memory.efc_J)
     if memory.sparse[0] != 0:
         for k in range(memory.nv):
@@ -48,9 +51,9 @@ def read_mass(
     first: wp.int32,
     last: wp.int32,
 ):
-    """Mass matrix with the constraints of all rows but those from ``first`` to ``last``; see ``response_kernels``.
+    """Mass matrix with the constraints of all other rows; see ``response_kernels``.
 
-    ``entries``, ``starts``, ``columns``: of MuJoCo's sparse lower triangle.
+    Other than those from ``first`` to ``last``. ``entries``, ``starts``, ``columns``: of MuJoCo's sparse lower triangle.
     """
     mass = doubles(memory, env, memory.M)
     for m in range(memory.nv):

@@ -1,4 +1,4 @@
-"""Kernels on MuJoCo Warp's states: response of the gels' rows to forces, and lifts of slides that begin or end."""
+"""Response of gels' rows to forces, and lifts of slides, on states of MuJoCo Warp."""
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 # pyright: reportOperatorIssue=false, reportCallIssue=false, reportReturnType=false, reportAssignmentType=false
@@ -50,9 +50,9 @@ def read_mass(
     i: wp.int32,
     count: wp.int32,
 ):
-    """Mass matrix with all constraints but the first ``count`` contacts of gels; see ``response_kernels``.
+    """Mass matrix with the constraints of all other rows; see ``response_kernels``.
 
-    ``entries``, ``starts``, ``columns``: of MuJoCo Warp's sparse lower triangle.
+    Other than those of the first ``count`` contacts of gels. ``entries``, ``starts``, ``columns``: of MuJoCo Warp's sparse lower triangle.
     """
     response = lifts.response
     for m in range(worlds.nv):
