@@ -24,6 +24,9 @@ Half of it, and some rounding.
 """
 
 
+EARLY = 20
+
+
 @wp.kernel
 def start_step(friction: wp.int32, d: Decisions, f: Flags):
     """Resets everything for a step; ``alive`` and ``progress`` are set."""
@@ -48,6 +51,7 @@ def start_step(friction: wp.int32, d: Decisions, f: Flags):
     d.line_search[env] = 0
     d.project[env] = 0
     d.speed[env] = zero
+    d.size[env] = wp.float64(wp.inf)
     d.ccd[env] = wp.float64(1.0)
     d.min_gap[env] = wp.float64(wp.inf)
     d.min_det[env] = wp.float64(wp.inf)
@@ -93,8 +97,11 @@ def after_lag(tolerance: wp.float64, max_relags: wp.int32, d: Decisions, f: Flag
     d.settled[env] = d.lagging[env]
     if d.lagging[env] == 0:
         return
-    f.settled[0] = 1
     d.pending[env] = 0
+    if d.active[env] != 0:  # within Newton's iterations
+        d.settled[env] = 0
+        return
+    f.settled[0] = 1
     if d.relags[env] >= 0:
         if d.changed[env] <= tolerance or (2 * d.relags[env] >= max_relags and d.sum_changed[env] <= tolerance):
             return
@@ -339,6 +346,9 @@ def conclude(tolerance: wp.float64, max_newton: wp.int32, max_relags: wp.int32, 
                 d.active[env] = 0
     if was_active != 0 and d.since_lag[env] >= max_newton:
         d.active[env] = 0
+    if was_active != 0 and d.active[env] != 0 and d.relags[env] == 0 and max_relags > 0 and d.plain[env] != 0:
+        if d.since_lag[env] <= EARLY:
+            d.pending[env] = 1
     # Where Newton gave up, forces are no better known after another lag; the first two may still help it on.
     if was_active != 0 and d.active[env] == 0 and friction != 0 and max_relags > 0:
         if d.converged[env] != 0 or (d.relags[env] < 2 and d.relags[env] < max_relags):
