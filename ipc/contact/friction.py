@@ -458,9 +458,9 @@ def friction_rows(
                 axis = wp.vec3d(wp.float64(0.0), wp.float64(1.0), wp.float64(0.0))
             along = wp.normalize(axis - wp.dot(axis, n) * n)
         across = wp.cross(n, along)
-        curvature = friction_curvature(y, eps)
-        if y < last[env]:
-            curvature = ratio
+        # Where Newton's steps are longer than the slip, the law's curvature says nothing of where they lead. The paraboloid that touches
+        # the law at y lies above it everywhere (a majoriser: Hunter and Lange, A tutorial on MM algorithms, Am. Stat. 58, 2004).
+        curvature = wp.where(y < last[env], ratio, friction_curvature(y, eps))
         p, q = wp.sqrt(limit * curvature), wp.sqrt(limit * ratio)
         if p > wp.float64(0.0):
             push_row(out, env, verts, (p * c[0]) * along, (p * c[1]) * along, (p * c[2]) * along, (p * c[3]) * along)
