@@ -203,12 +203,15 @@ class PressController:
         return np.where(np.isfinite(self._force) & ~self.failed, self._force - self._solver.normal_force(), 0.0)
 
     def _rest(self) -> None:
-        """Let a free object come to rest under its weight."""
+        """Let a free object come to rest under its weight: slow at two steps in succession, as at a turning point it is not."""
         assert self._weight > 0.0
         self._solver.set_gravity(float(self._force[0]) / self._weight)
+        is_slow = is_at_rest = np.zeros(self.num_envs, bool)
         for _ in range(4 * self._control.force_steps):
             self._step()
-            is_at_rest = (self._solver.speed() < self._control.rest_speed) & (self._solver.normal_force() > 0.0)
+            was_slow = is_slow
+            is_slow = (self._solver.speed() < self._control.rest_speed) & (self._solver.normal_force() > 0.0)
+            is_at_rest = was_slow & is_slow
             if (is_at_rest | self.failed).all():
                 return
-        self.failed |= self._solver.speed() >= self._control.rest_speed
+        self.failed |= ~is_at_rest
