@@ -50,7 +50,7 @@ def start_step(friction: wp.int32, d: Decisions, f: Flags):
     d.line_search[env] = 0
     d.project[env] = 0
     d.speed[env] = zero
-    d.size[env] = zero
+    d.last[env] = zero
     d.ccd[env] = wp.float64(1.0)
     d.min_gap[env] = wp.float64(wp.inf)
     d.min_det[env] = wp.float64(wp.inf)
@@ -328,6 +328,7 @@ def conclude(tolerance: wp.float64, max_newton: wp.int32, max_relags: wp.int32, 
         d.newton[env] = d.newton[env] + 1
         d.since_lag[env] = d.since_lag[env] + 1
         d.linear[env] = d.linear[env] + d.pcg_iterations[env]
+        d.last[env] = d.size[env]
     if d.plain[env] != 0:
         d.ready[env] = 1
         slow = d.speed[env] <= tolerance
