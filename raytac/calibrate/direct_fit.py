@@ -4,8 +4,8 @@ Residuals are those of the presses with the real background B as flat field, and
 
     I = encode((decode(B) − b) · L(pressed) / L(rest) + b),
 
-solved by Levenberg and Marquardt's method with a prior on every parameter. What direct light lacks (shadows, inter-reflection, the size
-of LEDs) can be given as ``extra`` light of every LED, with its slopes by the LED's place and height (``ray_fit``).
+solved by Levenberg and Marquardt's method with a prior on every parameter. What direct light lacks (shadows, inter-reflection, a
+specular coat) can be given as ``extra`` light of every LED, with its slopes by the LED's place and size (``ray_fit``).
 """
 
 from __future__ import annotations
@@ -19,26 +19,27 @@ import numpy as np
 
 from raytac.calibrate.direct_light import ExtraLight, LedLight, Light, case_light, led_light
 from raytac.calibrate.imprint import PixelGeometry, pixel_geometry
+from raytac.calibrate.light_bounds import leds_inside
 from raytac.calibrate.light_parameters import (
-    CEILING,
     DARKEST,
     HEIGHT,
-    HEIGHTS,
+    LENGTH,
     REFERENCE_DISTANCE,
-    VIRTUAL_CEILING,
     LightParameters,
     darkest,
+    mean_power,
     side_ties,
 )
 from raytac.calibrate.photographs import Photographs, decode, encode
-from raytac.specs import LightsSpec, SensorSpec
-from raytac.specs.sensor_check import view_edges
+from raytac.optics.trace.quadrature import EdgePoints
+from raytac.specs import SensorSpec
 
 SIGMA = {
     "place": 4.0,
     "aim": 0.6,
     "lobe": 2.0,
     "height": 1.0,
+    "length": 4.0,
     "power": 2.0,
     "glow": 0.5,
     "gamma": 0.5,
@@ -46,7 +47,7 @@ SIGMA = {
     "vignette": 0.5,
     "slope": 0.15,
 }
-"""Standard deviation of a parameter about its start [mm, rad, 1 or full scales]."""
+"""Standard deviation of a parameter about its start [mm, rad, 1]; of powers over the start's mean."""
 CIRCLE_SIGMA = np.array([1.0, 1.0, 1.5]) / 320
 """Standard deviation of a circle's x, y and radius about its label, over the image's width."""
 BORDER_SIGMA = 4.0
@@ -57,8 +58,6 @@ ACTIVE = 6
 """Most times that a step is solved for with more parameters at their bounds."""
 STEP = 1e-5
 """Step of the derivatives by response and imprint."""
-_WIDEST_PART = 2e-3
-"""Distance [m] from an LED's centre to a corner that the coat's sag is taken at."""
 REST_FACTOR = 8
 """The image at rest is fitted as means of so many pixels squared."""
 
@@ -134,12 +133,32 @@ class DirectFit:
         self.flat_geometry = self._geometry(start, self.u, self.v, np.full(len(self.u), -1))
         self.rest_geometry = self._geometry(start, self.rest_u, self.rest_v, np.full(len(self.rest_u), -1))
         self.extra, self.shape = extra, (height, width)
-        # Images depend on the heights of LEDs by shadows alone.
-        self._sees_heights = extra is not None and HEIGHT in extra.by_led
+        self.points = start.p.smooth_points
         wider = np.where(shots.fully_visible, 1.0, BORDER_SIGMA)[:, None]
         self.circle_sigma = CIRCLE_SIGMA * native[0] * wider
         self.ties = side_ties(start.p, len(self.flat(start)))
         self.anchor, self.hold = self.flat(start), 0.0
+
+    def with_points(self, points: tuple[EdgePoints, ...]) -> DirectFit:
+        """The same problem with ``points`` on its LEDs.
+
+        They stay as LEDs move, so that images are smooth in every parameter.
+        """
+        other = copy.copy(self)
+        other.points = points
+        return other
+
+    def with_fixed(self, *names: str) -> DirectFit:
+        """The same problem with further blocks of parameters that stay."""
+        other = copy.copy(self)
+        other.settings = dataclasses.replace(self.settings, fixed=(*self.settings.fixed, *names))
+        return other
+
+    def with_extra(self, extra: ExtraLight) -> DirectFit:
+        """The same problem with light beyond the direct light."""
+        other = copy.copy(self)
+        other.extra = extra
+        return other
 
     def near(self, state: FitState, hold: float) -> DirectFit:
         """The same problem with LEDs held near those of ``state``.
@@ -166,7 +185,10 @@ class DirectFit:
     def light(self, p: LightParameters, seen: PixelGeometry) -> Light:
         """Light at what ``seen`` gives, at the same pixels at rest and over the image at rest."""
         geometries = (seen, self.flat_geometry, self.rest_geometry)
-        return Light(*(self._led_layers(p, g, [led_light(g, led, REFERENCE_DISTANCE) for led in p.leds]) for g in geometries))
+        return Light(*(self._led_layers(p, g, self._leds(p, g)) for g in geometries))
+
+    def _leds(self, p: LightParameters, seen: PixelGeometry) -> list[LedLight]:
+        return [led_light(seen, led, points, REFERENCE_DISTANCE) for led, points in zip(p.leds, self.points, strict=True)]
 
     def _led_layers(self, p: LightParameters, seen: PixelGeometry, leds: list[LedLight]) -> np.ndarray:
         """(L, M, 3): direct light of every LED and the even glow that goes with it."""
@@ -190,16 +212,31 @@ class DirectFit:
 
     def blocks(self, p: LightParameters) -> list[tuple[str, int]]:
         """Name (of ``SIGMA``) of every parameter of the vector's blocks, and how many follow."""
-        per_led = [("place", 3), ("aim", 2), ("lobe", 1), ("height", 1)] * len(p.leds)
+        per_led = [("place", 3), ("aim", 2), ("lobe", 1), ("height", 1), ("length", 1)] * len(p.leds)
         rest = [("glow", 3), ("gamma", 1), ("stray", 3), ("vignette", 2), ("slope", len(self.start.slopes))]
         return [*per_led, ("power", p.power.size), *rest]
 
     def sigma(self, p: LightParameters) -> np.ndarray:
-        return np.concatenate([np.full(n, SIGMA[name]) for name, n in self.blocks(p)])
+        """Standard deviation of every parameter about its start, (n,)."""
+        unit = {"power": mean_power(self.start.p)}
+        return np.concatenate([np.full(n, SIGMA[name] * unit.get(name, 1.0)) for name, n in self.blocks(p)])
 
     def free(self, p: LightParameters) -> np.ndarray:
-        fixed = (*self.settings.fixed, *(() if self._sees_heights else ("height",)))
-        return np.concatenate([np.full(n, name not in fixed) for name, n in self.blocks(p)])
+        """True for parameters that are fitted, and that images depend on, (n,)."""
+        free = np.concatenate([np.full(n, name not in self.settings.fixed) for name, n in self.blocks(p)])
+        for column, seen in zip((LENGTH, HEIGHT), self.sees_sizes(), strict=True):
+            free[column : p.leds.size : p.leds.shape[1]] &= seen
+        return free
+
+    def sees_sizes(self) -> tuple[np.ndarray, np.ndarray]:
+        """True for LEDs on whose length and on whose height images depend, (L,) each.
+
+        An edge has an extent for direct light if it has more than one point, and for extra light if that has its slope.
+        """
+        by_led = () if self.extra is None else self.extra.by_led
+        counts = np.array([points.by_edge for points in self.points])
+        length, height = ((counts[:, k] > 1) | (column in by_led) for k, column in enumerate((LENGTH, HEIGHT)))
+        return length, height
 
     def flat(self, state: FitState) -> np.ndarray:
         p = state.p
@@ -215,15 +252,10 @@ class DirectFit:
         return FitState(changed, slopes, circles)
 
     def inside_bounds(self, state: FitState) -> FitState:
-        """Every parameter moved to what a sensor accepts: LEDs in the case, heights in ``HEIGHTS``."""
-        p = state.p
-        leds, response = p.leds.copy(), p.response.copy()
-        leds[:, 4], leds[:, 5] = np.clip(leds[:, 4], -1.4, 1.4), np.clip(leds[:, 5], 1.0, 15.0)
-        if self._sees_heights:
-            leds[:, HEIGHT] = np.clip(leds[:, HEIGHT], *HEIGHTS)
-        reach = 0.02 + _reach(p.template, leds)
-        low, high = self._space(p, leds)
-        leds[:, :3] = np.clip(leds[:, :3], reach + low, np.maximum(high - reach, reach + low))
+        """Every parameter moved to what a sensor accepts (``leds_inside``)."""
+        p, response = state.p, state.p.response.copy()
+        length, height = self.sees_sizes()
+        leds = leds_inside(self.sensor, p, lengths=length, heights=height)
         response[0], response[1:4] = np.clip(response[0], 1.0, 2.4), np.clip(response[1:4], 0, DARKEST)
         a1 = np.clip(response[4], -2.0, 0.5)
         response[4], response[5] = a1, np.clip(response[5], max(-0.3, -0.75 - a1), 1.5)
@@ -231,26 +263,6 @@ class DirectFit:
         circles = state.circles.copy()
         circles[:, 2] = np.clip(circles[:, 2], 3, None)
         return FitState(changed, state.slopes, circles)
-
-    def _space(self, p: LightParameters, leds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Least and largest x, y and z [mm] of LEDs, (L, 3) each, before what they reach.
-
-        LEDs lie in the case and below gel and plate; virtual sources up to the coat, on that side of the view where they begin.
-        """
-        half, pad = 5e2 * np.array(self.sensor.case.size), self.sensor.gelpad
-        high = np.tile([*half, CEILING], (len(leds), 1))
-        low = np.tile([*-half, 1e3 * self.sensor.case.floor_z], (len(leds), 1))
-        places = np.array([led.position for led in p.template.leds])
-        x_edges, y_edges = view_edges(self.sensor)
-        for k in np.flatnonzero(p.virtual):
-            x, y = places[k, :2]
-            beyond = [(x_edges[0] - x, 0, high, x_edges[0]), (x - x_edges[1], 0, low, x_edges[1])]
-            beyond += [(y_edges[0] - y, 1, high, y_edges[0]), (y - y_edges[1], 1, low, y_edges[1])]
-            _, axis, bound, edge = max(beyond, key=lambda side: side[0])
-            bound[k, axis] = 1e3 * edge
-            inside = [min(abs(c) + _WIDEST_PART, size / 2) for c, size in zip(1e-3 * leds[k, :2], pad.size, strict=True)]
-            high[k, 2] = VIRTUAL_CEILING - 1e3 * pad.sag(*inside)
-        return low, high
 
     def residuals(self, state: FitState) -> tuple[np.ndarray, np.ndarray]:
         """Residuals [levels] of pressed pixels (M, 3) and the image at rest (K, 3), not weighted."""
@@ -280,7 +292,7 @@ class DirectFit:
         """Jacobians of presses (3M, G), rest (3K, G) and presses by circles (3M, 3); both images."""
         p, seen = state.p, self.geometry(state)
         geometries = (seen, self.flat_geometry, self.rest_geometry)
-        leds = [[led_light(g, led, REFERENCE_DISTANCE) for led in p.leds] for g in geometries]
+        leds = [self._leds(p, g) for g in geometries]
         whole = self._with_extra(p, Light(*(self._led_layers(p, g, part) for g, part in zip(geometries, leds, strict=True))))
         total = _summed(p, whole)
         image, rest = self.images(p, total)
@@ -298,7 +310,7 @@ class DirectFit:
         for led in range(count):
             for k in range(wide):
                 of_extra = [part[led] for part in by_led[k].parts] if k in by_led else none
-                own = [part[led].by_led[k][:, None] if k < len(part[led].by_led) else 0.0 for part in leds]
+                own = [part[led].by_led[k][:, None] for part in leds]
                 column(wide * led + k, *((a + b) * p.power[led] for a, b in zip(own, of_extra, strict=True)))
         for led in range(count):
             for c in range(3):
@@ -386,6 +398,9 @@ class DirectFit:
         pushed = self.at(x - 1e-9 * np.sign(slope[:size]), state.circles)
         stuck = np.abs(self.flat(self.inside_bounds(pushed)) - self.flat(pushed)) > 1e-12
         movable = np.concatenate([free & ~stuck, np.full(3 * count, settings.circles)])
+        follows = np.eye(n)
+        follows[:size, :size] = self._following(x, slope[:size], free & stuck, free & ~stuck)
+        normal, slope = follows.T @ normal @ follows, follows.T @ slope
 
         def trial(damping: float) -> FitState:
             damped = normal + np.diag(damping * np.diag(normal))
@@ -394,16 +409,32 @@ class DirectFit:
             for _ in range(ACTIVE):
                 fixed = damped[np.ix_(move, ~move)] @ change[~move]
                 change[move] = np.linalg.solve(damped[np.ix_(move, move)], -slope[move] - fixed)
-                proposed = self.at(x + change[:size], state.circles + change[size:].reshape(-1, 3))
+                moved = (follows @ change)[:size]
+                proposed = self.at(x + moved, state.circles + change[size:].reshape(-1, 3))
                 allowed = self.inside_bounds(proposed)
                 over = move[:size] & (np.abs(self.flat(allowed) - self.flat(proposed)) > 1e-12)
                 if not over.any():
                     break
                 change[:size][over] = (self.flat(allowed) - x)[over]
                 move[:size] &= ~over
+            change = follows @ change
             return self.inside_bounds(self.at(x + change[:size], state.circles + change[size:].reshape(-1, 3)))
 
         return trial
+
+    def _following(self, x: np.ndarray, slope: np.ndarray, stuck: np.ndarray, free: np.ndarray) -> np.ndarray:
+        """Motion (n, n) of all parameters by one of each that is free: the others' own, and of those ``stuck`` at a bound that moves.
+
+        What an LED reaches depends on its size and aim, and with it where its middle may lie.
+        """
+        motion, circles = np.eye(len(x)), self.start.circles
+        if not stuck.any():
+            return motion
+        beyond = x - 1e3 * STEP * np.sign(slope) * stuck
+        for k in np.flatnonzero(free[: self.start.p.leds.size]):
+            ends = [self.flat(self.inside_bounds(self.at(beyond + sign * STEP * np.eye(len(x))[k], circles))) for sign in (1, -1)]
+            motion[stuck, k] = ((ends[0] - ends[1]) / (2 * STEP))[stuck]
+        return motion
 
     def solve(self, state: FitState, iterations: int, tick: Callable[[FitState, float], None] | None = None) -> FitState:
         """Levenberg and Marquardt's method from ``state``; ``tick(state, cost)`` at accepted steps."""
@@ -443,12 +474,3 @@ def _draw(rho: np.ndarray, settings: FitSettings, seed: int) -> tuple[np.ndarray
 def _summed(p: LightParameters, light: Light) -> list[np.ndarray]:
     """All LEDs at their powers, (M, 3) of each part of ``light``."""
     return [np.maximum(np.einsum("lmc,lc->mc", part, p.power), 1e-6) for part in light.parts]
-
-
-def _reach(lights: LightsSpec, leds: np.ndarray) -> np.ndarray:
-    """Half extents [mm] of every LED's rectangle along x, y and z, (L, 3)."""
-    (sin_a, cos_a), (sin_e, cos_e) = ((np.sin(leds[:, k]), np.cos(leds[:, k])) for k in (3, 4))
-    u = np.stack([-sin_a, cos_a, np.zeros(len(leds))], axis=1)
-    v = np.stack([-sin_e * cos_a, -sin_e * sin_a, cos_e], axis=1)
-    width = 5e2 * np.array([[led.size[0]] for led in lights.leds])
-    return width * np.abs(u) + 0.5 * leds[:, HEIGHT, None] * np.abs(v)

@@ -1,10 +1,17 @@
-"""Direct light of point LEDs on a Lambertian coat, with derivatives, in NumPy for fits.
+"""Direct light of extended LEDs on a Lambertian coat, with derivatives, in NumPy for fits.
 
-It is the diffuse part of the ray tracer's own sum (``raytac.optics.trace.fast_tracer``) with one point an LED and no visibility:
+It is the diffuse part of the ray tracer's own sum (``raytac.optics.trace.fast_tracer``) with the same points on an LED's rectangle, and
+no visibility:
 
-    D = c^n · cos θ · d₀² / r²,  c = −w · a,  cos θ = w · n_p,  w = (l − p) / r,
+    D = Σ_k w_k ρ_k L(l_k),  L(l) = c^n · cos θ · d₀² / r²,  c = −w · a,  cos θ = w · n_p,  w = (l − p) / r,
 
-for an LED at l with axis a and lobe n, a point p with normal n_p, and the distance d₀ at which power 1 is full scale.
+for points l_k of an LED with axis a and lobe n, a point p with normal n_p, and the distance d₀ at which power 1 is full scale. Points of
+the longer edge lie at Gauss's places over the angle that it spans, seen from p (``raytac.optics.trace.led.Sight``): with F the foot's place
+before the edge's middle, R the distance of its line and h half its length,
+
+    x_k = R tan φ_k − F,  φ_k = (1 − g_k) φ₀ + g_k φ₁,  tan φ₀,₁ = (F ∓ h) / R,  ρ_k = (φ₁ − φ₀) R / (2 h cos² φ_k).
+
+Derivatives are those of this sum, with all that the points move by.
 """
 
 from __future__ import annotations
@@ -16,6 +23,7 @@ import numpy as np
 
 from raytac.calibrate.imprint import PixelGeometry
 from raytac.optics.trace.led import lobe_gain, lobe_slopes
+from raytac.optics.trace.quadrature import EdgePoints, gauss
 
 _BEHIND = 1e-3
 """Least cosine of an LED's lobe: its powers stay differentiable behind the LED."""
@@ -30,21 +38,46 @@ class LedLight:
     light: np.ndarray
     """D, (M,)."""
     by_led: np.ndarray
-    """By the first six of a row of ``LightParameters.leds``, (6, M); a point has no height.
-    Position [1/mm], azimuth and elevation [1/rad], lobe."""
+    """By a row of ``LightParameters.leds``, (8, M): position [1/mm], azimuth and elevation [1/rad], lobe, height and length [1/mm].
+    An edge with one point has no extent."""
     by_normal: np.ndarray
     """By the point's normal, (3, M). By the point itself it is minus that by the LED's position."""
 
 
-def led_light(seen: PixelGeometry, led: np.ndarray, reference: float) -> LedLight:
-    """``led``: row of ``LightParameters.leds``; ``reference`` [m]: d₀."""
-    azimuth, elevation, lobe = led[3:6]
-    (sa, ca), (se, ce) = ((np.sin(x), np.cos(x)) for x in (azimuth, elevation))
-    axis, by_azimuth, by_elevation = np.array([[ce * ca, ce * sa, se], [-ce * sa, ce * ca, 0], [-se * ca, -se * sa, ce]])
-    d = 1e-3 * led[:3, None] - seen.p
+@dataclass(frozen=True)
+class _Frame:
+    """Axis and edges of an LED, unit vectors (3,), and their slopes by azimuth and elevation, (2, 3)."""
+
+    axis: np.ndarray
+    axis_slopes: np.ndarray
+    edges: tuple[np.ndarray, np.ndarray]
+    edge_slopes: tuple[np.ndarray, np.ndarray]
+
+    @classmethod
+    def of(cls, azimuth: float, elevation: float) -> _Frame:
+        """The frame of ``LedSpec.edges``: u = z × a and v = a × u."""
+        (sa, ca), (se, ce) = ((np.sin(x), np.cos(x)) for x in (azimuth, elevation))
+        axis, u, v = np.array([[ce * ca, ce * sa, se], [-sa, ca, 0], [-se * ca, -se * sa, ce]])
+        none = np.zeros(3)
+        return cls(axis, np.array([ce * u, v]), (u, v), (np.array([[-ca, -sa, 0], none]), np.array([-se * u, -axis])))
+
+
+@dataclass(frozen=True)
+class _PointLight:
+    """Light of one point of an LED, its slopes by the point, the aim's two angles and the lobe."""
+
+    light: np.ndarray
+    by_place: np.ndarray
+    by_aim: np.ndarray
+    by_lobe: np.ndarray
+    by_normal: np.ndarray
+
+
+def _point_light(seen: PixelGeometry, d: np.ndarray, frame: _Frame, lobe: float, reference: float) -> _PointLight:
+    """Light of a point at ``d`` (3, M) [m] from the points ``seen``."""
     inverse = 1 / np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
     w = d * inverse
-    towards = -(axis @ w)
+    towards = -(frame.axis @ w)
     c = np.maximum(towards, _BEHIND)
     by_cosine, by_lobe = lobe_slopes(towards, lobe, _BEHIND)
     cosine = w[0] * seen.n[0] + w[1] * seen.n[1] + w[2] * seen.n[2]
@@ -52,16 +85,99 @@ def led_light(seen: PixelGeometry, led: np.ndarray, reference: float) -> LedLigh
     soft = 0.5 * (cosine + root)
     arriving = lobe_gain(np, towards, lobe, _BEHIND) * (reference * inverse) ** 2
     light = arriving * soft
-    by_normal = arriving * (0.5 * (1 + cosine / root)) * w
-    steep = by_cosine * light
-    by_led = np.empty((6, len(light)))
-    # ∂c/∂l = −(a + c w) / r, ∂cos/∂l = (n_p − cos w) / r, ∂r⁻²/∂l = −2 w r⁻³.
-    turned = by_normal[0] * w[0] + by_normal[1] * w[1] + by_normal[2] * w[2]
     slope = arriving * (0.5 * (1 + cosine / root))
-    for k in range(3):
-        by_led[k] = -steep * (axis[k] + c * w[k]) + slope * seen.n[k] - (turned * cosine + 2 * light) * w[k]
-    by_led[:3] *= 1e-3 * inverse
-    by_led[3], by_led[4], by_led[5] = -steep * (by_azimuth @ w), -steep * (by_elevation @ w), light * by_lobe
+    steep = by_cosine * light
+    # ∂c/∂l = −(a + c w) / r, ∂cos/∂l = (n_p − cos w) / r, ∂r⁻²/∂l = −2 w r⁻³.
+    along = steep * c + slope * cosine + 2 * light
+    by_place = inverse * (slope * seen.n - steep * frame.axis[:, None] - along * w)
+    by_aim = -steep * (frame.axis_slopes @ w)
+    return _PointLight(light, by_place, by_aim, light * by_lobe, slope * w)
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Place x [m] on the longer edge, its density, and the slopes of x and log density.
+
+    Slopes are by the foot F, the distance R and half the edge's length h, three arrays (M,) each.
+    """
+
+    x: np.ndarray
+    density: np.ndarray
+    x_slopes: tuple[np.ndarray, ...]
+    log_slopes: tuple[np.ndarray, ...]
+
+
+def _places(foot: np.ndarray, distance: np.ndarray, half: float, count: int) -> list[_Place]:
+    """Places of ``count`` points on the longer edge; one is its middle."""
+    if count == 1:
+        none = np.zeros_like(foot)
+        return [_Place(none, none + 1, (none,) * 3, (none,) * 3)]
+    ends, slopes = [], []
+    for sign in (-1, 1):
+        end = foot + sign * half
+        square = distance**2 + end**2
+        ends.append(np.arctan2(end, distance))
+        slopes.append((distance / square, -end / square, sign * distance / square))
+    span, span_slopes = ends[1] - ends[0], [b - a for a, b in zip(*slopes, strict=True)]
+    places = []
+    for share, weight in gauss(count):
+        angle = ends[0] + share * span
+        turned = [a + share * s for a, s in zip(slopes[0], span_slopes, strict=True)]
+        tangent = np.tan(angle)
+        secant = 1 + tangent * tangent
+        own_x = (-1.0, tangent, 0.0)
+        own_log = (0.0, 1 / distance, -1 / half)
+        places.append(
+            _Place(
+                distance * tangent - foot,
+                weight * 0.5 * span * distance * secant / half,
+                tuple(distance * secant * t + o for t, o in zip(turned, own_x, strict=True)),
+                tuple(s / span + 2 * tangent * t + o for s, t, o in zip(span_slopes, turned, own_log, strict=True)),
+            )
+        )
+    return places
+
+
+def led_light(seen: PixelGeometry, led: np.ndarray, points: EdgePoints, reference: float) -> LedLight:
+    """``led``: row of ``LightParameters.leds``; ``reference`` [m]: d₀."""
+    frame, lobe = _Frame.of(*led[3:5]), led[5]
+    long, short = (1, 0) if points.upright else (0, 1)
+    halves = 0.5e-3 * led[7], 0.5e-3 * led[6]
+    (e, f), (half, other) = (frame.edges[long], frame.edges[short]), (halves[long], halves[short])
+    q = 1e-3 * led[:3, None] - seen.p
+    light, by_lobe, by_other, by_foot, by_distance, by_half = np.zeros((6, len(seen.p[0])))
+    by_place, by_e, by_f = np.zeros((3, *q.shape))
+    by_normal = np.zeros(q.shape)
+    by_aim = np.zeros((2, len(light)))
+    foot = e @ q
+    distance = np.sqrt(np.maximum(np.einsum("km,km->m", q, q) - foot * foot, 1e-12))
+    for place in _places(foot, distance, half, points.along):
+        for share, weight in gauss(points.across):
+            y = (2 * share - 1) * other
+            one = _point_light(seen, q + e[:, None] * place.x + (f * y)[:, None], frame, lobe, reference)
+            density = weight * place.density
+            along = e @ one.by_place
+            light += density * one.light
+            by_place += density * one.by_place
+            by_aim += density * one.by_aim
+            by_lobe += density * one.by_lobe
+            by_normal += density * one.by_normal
+            by_e += density * place.x * one.by_place
+            by_f += density * y * one.by_place
+            by_other += density * (2 * share - 1) * (f @ one.by_place)
+            by_foot += density * (along * place.x_slopes[0] + one.light * place.log_slopes[0])
+            by_distance += density * (along * place.x_slopes[1] + one.light * place.log_slopes[1])
+            by_half += density * (along * place.x_slopes[2] + one.light * place.log_slopes[2])
+    # F = e · q and R² = q² − F².
+    by_line = by_distance / distance
+    rise = by_foot - by_line * foot
+    by_led = np.empty((8, len(light)))
+    by_led[:3] = 1e-3 * (by_place + rise * e[:, None] + by_line * q)
+    for k in (0, 1):
+        turned_e, turned_f = frame.edge_slopes[long][k], frame.edge_slopes[short][k]
+        by_led[3 + k] = by_aim[k] + turned_e @ by_e + turned_f @ by_f + rise * (turned_e @ q)
+    by_led[5] = by_lobe
+    by_led[7 - long], by_led[7 - short] = 0.5e-3 * by_half, 0.5e-3 * by_other
     return LedLight(light, by_led, by_normal)
 
 
@@ -94,12 +210,12 @@ class ExtraLight:
 
     light: Light
     at: np.ndarray
-    """(L, 7), rows as those of ``LightParameters.leds``."""
+    """(L, 8), rows as those of ``LightParameters.leds``."""
     by_led: Mapping[int, Light]
     """Slope of every LED's light by a column of its row; other columns change nothing."""
 
     def of(self, leds: np.ndarray) -> Light:
-        """The light of LEDs (L, 7)."""
+        """The light of LEDs (L, 8)."""
         light = self.light
         for k, slope in self.by_led.items():
             light = light.plus(slope, (leds[:, k] - self.at[:, k])[:, None, None])

@@ -1,8 +1,8 @@
 """Parameters of a fit of lights: LEDs, glow of the case, response; and ties between LEDs.
 
-An LED has place, aim, lobe, height and power. A press says something only about the light that reaches it, so LEDs far from all presses
-are poorly known. Ties carry over from those nearby: LEDs of one side are of one kind, and stand mirrored about the middle of their
-wall.
+An LED has place, aim, lobe, height, length and power. A press says something only about the light that reaches it, so LEDs far from all
+presses are poorly known. Ties carry over from those nearby: LEDs of one side are of one kind, and stand mirrored about the middle of
+their wall.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ import numpy as np
 
 from raytac.calibrate.photographs import decode
 from raytac.errors import InputError
-from raytac.specs import LightsSpec, SensorSpec
+from raytac.optics.trace.quadrature import EdgePoints, quadrature
+from raytac.specs import LedSpec, LightsSpec, SensorSpec
 
 CHANNELS = ("red", "green", "blue")
 DARKEST = 0.85
@@ -28,6 +29,10 @@ HEIGHT = 6
 """Column of a row of ``LightParameters.leds`` that has the height of the emitting face."""
 HEIGHTS = 0.1, 6.0
 """Range of a fitted height [mm]: from an LED to a light guide as high as a wall (a guess)."""
+LENGTH = 7
+"""Column that has the emitting face's length, along ``LedSpec.edges[0]``."""
+SHORTEST = 0.1
+"""Least of a fitted length [mm]; the most is what the case takes."""
 REFERENCE_DISTANCE = 10e-3
 """Distance [m] at which a power of 1 gives a coat facing the LED full scale."""
 
@@ -37,9 +42,9 @@ class LightParameters:
     """Parameters of lights and camera, as arrays."""
 
     template: LightsSpec
-    """The light file that names, layers and widths come from."""
+    """The light file that names and layers come from."""
     leds: np.ndarray
-    """(L, 7): x, y, z [mm], azimuth, elevation [rad], lobe, height of the emitting face [mm]."""
+    """(L, 8): x, y, z [mm], azimuth, elevation [rad], lobe, height and length of the emitting face [mm]."""
     power: np.ndarray
     """(L, 3) [full scales]: diffuse light of a coat at ``REFERENCE_DISTANCE`` facing the LED."""
     glow: np.ndarray
@@ -58,7 +63,7 @@ class LightParameters:
                 raise InputError("led.layer", value=led.layer, rule=rule, choices=CHANNELS)
             x, y, z = led.axis
             aim = np.arctan2(y, x), np.arcsin(np.clip(z, -1, 1))
-            leds.append([*(1e3 * c for c in led.position), *aim, led.lobe, 1e3 * led.size[1]])
+            leds.append([*(1e3 * c for c in led.position), *aim, led.lobe, 1e3 * led.size[1], 1e3 * led.size[0]])
             power.append(np.array(led.power) * full_scale(sensor))
         response = sensor.response
         stray = np.clip(np.array(response.black_level) / darkest(background, response.gamma), 0, DARKEST)
@@ -76,10 +81,23 @@ class LightParameters:
         """True for virtual sources, (L,)."""
         return np.array([led.virtual for led in self.template.leds])
 
-    def lights(self, sensor: SensorSpec) -> LightsSpec:
-        """The light file, for the coat and exposure of ``sensor``."""
-        leds, scale = [], full_scale(sensor)
-        for led, row, power, layer in zip(self.template.leds, self.leds, self.power, self.layer, strict=True):
+    @property
+    def points(self) -> tuple[EdgePoints, ...]:
+        """Points that the ray tracer takes on every LED."""
+        return tuple(quadrature(led) for led in self._placed())
+
+    @property
+    def smooth_points(self) -> tuple[EdgePoints, ...]:
+        """The same, but two at least across every strip: light then depends on all heights.
+
+        The ray tracer takes one across a thin strip, and steps to two where it seems 25 degrees high.
+        """
+        return tuple(dataclasses.replace(one, across=max(one.across, 2)) if one.along > 1 else one for one in self.points)
+
+    def _placed(self) -> list[LedSpec]:
+        """The LEDs with the powers of the template."""
+        leds = []
+        for led, row in zip(self.template.leds, self.leds, strict=True):
             flat, azimuth = np.cos(row[4]), row[3]
             leds.append(
                 dataclasses.replace(
@@ -87,12 +105,16 @@ class LightParameters:
                     position=(float(row[0] / 1e3), float(row[1] / 1e3), float(row[2] / 1e3)),
                     axis=(float(flat * np.cos(azimuth)), float(flat * np.sin(azimuth)), float(np.sin(row[4]))),
                     lobe=float(row[5]),
-                    size=(led.size[0], float(row[HEIGHT] / 1e3)),
-                    power=tuple(map(float, power / scale)),
-                    glow=float(self.glow[layer] / _GLOW),
+                    size=(float(row[LENGTH] / 1e3), float(row[HEIGHT] / 1e3)),
                 )
             )
-        return LightsSpec(tuple(leds))
+        return leds
+
+    def lights(self, sensor: SensorSpec) -> LightsSpec:
+        """The light file, for the coat and exposure of ``sensor``."""
+        scale, glow = full_scale(sensor), self.glow[self.layer] / _GLOW
+        lit = zip(self._placed(), self.power, glow, strict=True)
+        return LightsSpec(tuple(dataclasses.replace(led, power=tuple(map(float, w / scale)), glow=float(g)) for led, w, g in lit))
 
 
 _GLOW = np.pi * REFERENCE_DISTANCE**2
@@ -104,6 +126,11 @@ def full_scale(sensor: SensorSpec) -> np.ndarray:
     coat, response = sensor.coat, sensor.response
     diffuse = (1 - coat.specular) * np.array(coat.reflectance) / np.pi
     return response.gain * np.array(response.white_balance) * diffuse / REFERENCE_DISTANCE**2
+
+
+def mean_power(p: LightParameters) -> float:
+    """Mean over LEDs of their power in the channel that they light most [full scales]."""
+    return max(float(p.power.max(1).mean()), 1e-6)
 
 
 def with_parameters(sensor: SensorSpec, p: LightParameters, background: np.ndarray) -> SensorSpec:
@@ -120,9 +147,9 @@ def darkest(background: np.ndarray, gamma: float) -> np.ndarray:
     return np.maximum(decode(background.reshape(-1, 3).min(0), gamma), 1e-6)
 
 
-PLACE, AIM, LOBE, TALL, POWER = 1.0, 0.2, 1.0, 0.5, 0.2
+PLACE, AIM, LOBE, TALL, LONG, POWER = 1.0, 0.2, 1.0, 0.5, 0.5, 0.3
 """Standard deviations of LEDs about mirrored places [mm] and aims [rad], and about the
-lobe, height [mm] and power [full scales] of the LED beside them."""
+lobe, height and length [mm] and power (over the mean power) of the LED beside them."""
 
 LEAST = 1.0
 """Least distance [mm] of a layer's LEDs from the pad's middle, to be on one side of it."""
@@ -183,6 +210,7 @@ def side_ties(p: LightParameters, size: int) -> Ties:
         for a, b in itertools.pairwise(own):
             tie(LOBE, 0.0, (wide * a + 5, 1), (wide * b + 5, -1))
             tie(TALL, 0.0, (wide * a + HEIGHT, 1), (wide * b + HEIGHT, -1))
+            tie(LONG, 0.0, (wide * a + LENGTH, 1), (wide * b + LENGTH, -1))
             for power in range(p.leds.size, p.leds.size + 3):
-                tie(POWER, 0.0, (power + 3 * a, 1), (power + 3 * b, -1))
+                tie(POWER * mean_power(p), 0.0, (power + 3 * a, 1), (power + 3 * b, -1))
     return Ties(np.array(rows).reshape(len(rows), size), np.array(offsets))

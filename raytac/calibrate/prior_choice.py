@@ -16,7 +16,7 @@ import numpy as np
 
 from raytac.calibrate.direct_fit import SIGMA, DirectFit, FitSettings, FitState
 from raytac.calibrate.photographs import Photographs
-from raytac.calibrate.ray_fit import FACTOR, FEWEST, first_state
+from raytac.calibrate.ray_fit import FACTOR, FEWEST, first_state, solve_direct
 from raytac.errors import InputError
 from raytac.specs import SensorSpec
 
@@ -63,7 +63,7 @@ def choose_strength(
         for train, test in _halves(shots.circles):
             fitted, tested = shots.take(train), shots.take(test)
             begin = first_state(sensor, fitted, own, seed)
-            state = DirectFit(sensor, fitted, begin, own, factor=FACTOR, seed=seed).solve(begin, STEPS)
+            _, state = solve_direct(DirectFit(sensor, fitted, begin, own, factor=FACTOR, seed=seed), begin, STEPS)
             start = FitState(state.p, state.slopes, tested.circles.copy())
             problem = DirectFit(sensor, tested, start, all_fixed, factor=FACTOR, seed=seed)
             off, _ = problem.residuals(problem.solve(start, CIRCLE_STEPS))

@@ -1,9 +1,9 @@
 """Lights fitted with the ray tracer as forward model, by defect correction.
 
-The ray tracer's image is direct light of points plus what that leaves out: shadows, the size of LEDs, inter-reflection, a specular coat.
-The rest is small, so that a few rounds suffice of: render with every LED in a layer of its own, take the ray tracer's light minus the
-direct light, and fit again with it added (``direct_fit``): held but for its slopes by the places and heights of LEDs, on which shadows
-depend.
+The ray tracer's image is direct light plus what that leaves out: shadows, inter-reflection, a specular coat. The rest is small, so that a
+few rounds suffice of: render with every LED in a layer of its own, take the ray tracer's light minus the direct light, and fit again with
+it added (``direct_fit``): held but for its slopes by the places and sizes of LEDs, on which shadows depend. Direct light has the points
+that the ray tracer takes on each LED at the round's beginning.
 """
 
 from __future__ import annotations
@@ -17,12 +17,13 @@ import numpy as np
 from raytac.calibrate.direct_fit import REST_FACTOR, SIGMA, DirectFit, FitSettings, FitState
 from raytac.calibrate.direct_light import ExtraLight, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
-from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LightParameters, with_parameters
+from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LENGTH, SHORTEST, LightParameters, with_parameters
 from raytac.calibrate.photographs import Photographs, decode
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid, make_grid
 from raytac.optics.base import casts_shadows
 from raytac.optics.trace.config import RayTraced
+from raytac.optics.trace.shadow import EXTENDED, angle
 from raytac.specs import SensorSpec
 
 GRID_PITCH = 0.12e-3
@@ -31,10 +32,12 @@ FACTOR = 2
 """Presses are fitted, and rendered, as means of so many pixels squared."""
 FIRST, LATER = 100, 30
 """Most solver steps with direct light alone, and in each round with the ray tracer's."""
-START_SPREAD = np.array([1.5, 1.5, 1.0, 0.2, 0.2, 0.5, 0.0])
+START_SPREAD = np.array([1.5, 1.5, 1.0, 0.2, 0.2, 0.5, 0.0, 0.0])
 """Standard deviation of the starts: mm, rad, lobe exponent, mm."""
-STEPS = {0: 0.4, 1: 0.4, 2: 0.4, HEIGHT: 0.5}
-"""Steps [mm] of slopes by an LED's place and height; shadows' soft edges are as wide."""
+STEPS = {0: 0.4, 1: 0.4, 2: 0.4, HEIGHT: 0.5, LENGTH: 1.0}
+"""Steps [mm] of slopes by an LED's place and size; shadows' soft edges are as wide."""
+LEAST = {HEIGHT: HEIGHTS[0], LENGTH: SHORTEST}
+"""Least size [mm] that is rendered for a slope."""
 FEWEST = 4
 """Fewest presses that a fit takes."""
 HOLD, HOLD_FACTOR = 1000.0, 8.0
@@ -101,24 +104,27 @@ def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, trac
 def extra_light(
     problem: DirectFit, state: FitState, grid: PadGrid, device: str, tracing: RayTraced, *, slopes: bool = True
 ) -> ExtraLight:
-    """The defect, and its slopes by the LEDs' places and heights.
+    """The defect, and its slopes by the LEDs' places and sizes; that of lengths where one is extended.
 
-    Slopes where shadows are cast and ``slopes`` is asked for. Every LED has a layer of its own, so that all move in one rendering:
-    eight more give all slopes, by central differences and without inter-reflection, which changes slowly. A step over an angle at which
-    the tracer takes more points for an LED (``optics.trace.direct``) adds the error of its quadrature to that slope.
+    Slopes where shadows are cast and ``slopes`` is asked for. Every LED has a layer of its own, so that all move in one rendering: eight
+    or ten more give all slopes, by central differences and without inter-reflection, which changes slowly.
     """
     lights: dict[int, Light] = {}
     if slopes and casts_shadows(problem.sensor, tracing.shadows):
         direct = dataclasses.replace(tracing, bounce=False)
+        extended = any(angle(led) > EXTENDED for led in state.p.lights(problem.sensor).leds)
         for k, step in STEPS.items():
+            if k == LENGTH and not extended:
+                continue
             ends = [state.p.leds.copy(), state.p.leds.copy()]
             for leds, offset in zip(ends, (-step, step), strict=True):
                 leds[:, k] += offset
-                if k == HEIGHT:
-                    leds[:, k] = np.maximum(leds[:, k], HEIGHTS[0])  # a height below 0 is that above
+                if k in LEAST:
+                    leds[:, k] = np.maximum(leds[:, k], LEAST[k])  # a size below 0 is that above
             apart = (ends[1][:, k] - ends[0][:, k])[:, None, None]
             states = [dataclasses.replace(state, p=dataclasses.replace(state.p, leds=leds)) for leds in ends]
-            below, above = (defect(problem, moved, grid, device, direct) for moved in states)
+            # With the tracer's own points, so that a step to another number of them is no slope of shadows.
+            below, above = (defect(problem.with_points(moved.p.points), moved, grid, device, direct) for moved in states)
             lights[k] = Light(*((b - a) / apart for a, b in zip(below.parts, above.parts, strict=True)))
     return ExtraLight(defect(problem, state, grid, device, tracing), state.p.leds.copy(), lights)
 
@@ -159,19 +165,20 @@ def fit_lights(
     rng, results, errors = np.random.default_rng(seed), [], []
     for k in range(starts):
         first = begin if k == 0 else brightened(problem, _perturbed(problem, begin, rng))
-        here = problem.solve(first, FIRST, report(f"direct light, start {k + 1} of {starts}"))
-        off = problem.residuals(here)
-        results.append((problem.cost(here, off), here))
+        own, here = solve_direct(problem, first, FIRST, report(f"direct light, start {k + 1} of {starts}"))
+        off = own.residuals(here)
+        results.append((own.cost(here, off), here))
         errors.append(float(np.abs(off[0][problem.inside]).mean()))
     _, state = min(results, key=lambda pair: pair[0])
+    problem = problem.with_points(state.p.smooth_points)
     grid, costs, hold = make_grid(sensor.gelpad, GRID_PITCH), [], 0.0
     if not rounds:
         costs.append(problem.cost(state, problem.residuals(state)))
     # A round's cost is known when its result has been rendered: the light that it was solved with is of first order only.
     best = problem, state
     for k in range(rounds + bool(rounds)):
-        extra = extra_light(problem, state, grid, device, tracing or RayTraced(), slopes=k < rounds)
-        problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, extra=extra, seed=seed)
+        problem = problem.with_points(state.p.smooth_points)
+        problem = problem.with_extra(extra_light(problem, state, grid, device, tracing or RayTraced(), slopes=k < rounds))
         costs.append(problem.cost(state, problem.residuals(state)))
         if costs[-1] <= min(costs):
             best, hold = (problem, state), hold / HOLD_FACTOR
@@ -182,6 +189,21 @@ def fit_lights(
             state = held.solve(best[1], LATER, report(f"all light, round {k + 1} of {rounds}"))
     _, state = best
     return Fitted(with_parameters(sensor, state.p, shots.background), state, tuple(costs), tuple(errors))
+
+
+def solve_direct(
+    problem: DirectFit, state: FitState, steps: int, tick: Callable[[FitState, float], None] | None = None
+) -> tuple[DirectFit, FitState]:
+    """Fit of direct light from ``state``, and the problem with the points of where it ended.
+
+    Sizes of LEDs stay at first: a long step makes an LED high, and keeps it from where it should lie. Then all parameters are fitted, with
+    the points of where LEDs are by then.
+    """
+    state = problem.with_fixed("length", "height").solve(state, steps, tick)
+    own = problem.with_points(state.p.smooth_points)
+    if own.points != problem.points or any(seen.any() for seen in own.sees_sizes()):
+        state = own.solve(state, steps, tick)
+    return own.with_points(state.p.smooth_points), state
 
 
 def _perturbed(problem: DirectFit, state: FitState, rng: np.random.Generator) -> FitState:
@@ -206,8 +228,7 @@ def refine_circles(
     problem = DirectFit(sensor, shots, own, all_fixed, factor=FACTOR, seed=seed)
     own, grid = problem.solve(own, 8), make_grid(sensor.gelpad, GRID_PITCH)
     for _ in range(rounds):
-        extra = extra_light(problem, own, grid, device, tracing or RayTraced(), slopes=False)
-        problem = DirectFit(sensor, shots, own, all_fixed, factor=FACTOR, extra=extra, seed=seed)
         # The prior is the label, not where direct light put the circle: DirectFit takes it from the photographs.
+        problem = problem.with_extra(extra_light(problem, own, grid, device, tracing or RayTraced(), slopes=False))
         own = problem.solve(own, 8)
     return own.circles

@@ -10,7 +10,7 @@ import pytest
 from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
 from raytac.calibrate.direct_light import ExtraLight, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
-from raytac.calibrate.light_parameters import HEIGHT, LightParameters, side_ties, with_parameters
+from raytac.calibrate.light_parameters import HEIGHT, LENGTH, LightParameters, side_ties, with_parameters
 from raytac.calibrate.photographs import Photographs, encode
 from raytac.calibrate.prior_choice import choose_strength
 from raytac.calibrate.ray_fit import extra_light, fit_lights, refine_circles
@@ -75,8 +75,22 @@ def known(sensor: SensorSpec) -> tuple[Photographs, FitState]:
     return direct(sensor, circles(6))
 
 
-def test_derivatives_agree_with_finite_differences(sensor: SensorSpec, known: tuple[Photographs, FitState]) -> None:
-    shots, state = known
+SIZES = {"points": [(2e-3, 1e-3)] * 3, "strips": [(22e-3, 4e-3), (18e-3, 4e-3), (4e-3, 6e-3)]}
+"""Lengths and heights [m] of three LEDs; a strip that stands has its longer edge upright."""
+
+
+def with_sizes(sensor: SensorSpec, sizes: list[tuple[float, float]]) -> SensorSpec:
+    """LEDs of these lengths and heights; those that stand look up, so that the camera sees their height."""
+    leds = (
+        dataclasses.replace(led, size=size, axis=(*(0.6 * c / np.hypot(*led.axis[:2]) for c in led.axis[:2]), -0.8))
+        for led, size in zip(sensor.lights.leds, sizes, strict=True)
+    )
+    return dataclasses.replace(sensor, lights=dataclasses.replace(sensor.lights, leds=tuple(leds)))
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_derivatives_agree_with_finite_differences(sensor: SensorSpec, kind: str) -> None:
+    shots, state = direct(with_sizes(sensor, SIZES[kind]), circles(6))
     p = dataclasses.replace(state.p, response=np.array([1.4, 0.3, 0.4, 0.5, -0.3, 0.05]))
     state = dataclasses.replace(state, p=p)
     problem = DirectFit(sensor, shots, state, FitSettings(samples=(40, 40)), factor=4)
@@ -86,8 +100,10 @@ def test_derivatives_agree_with_finite_differences(sensor: SensorSpec, known: tu
         """Up to a tenth of the direct light."""
         return Light(*(0.1 * part.mean() * rng.uniform(size=part.shape) for part in plain.parts))
 
-    extra = ExtraLight(some(), p.leds + 0.1, {k: some() for k in (0, 1, 2, HEIGHT)})
+    extra = ExtraLight(some(), p.leds + 0.1, {k: some() for k in ((0, 1, 2, HEIGHT, LENGTH) if kind == "points" else (0, 1, 2))})
     problem = DirectFit(sensor, shots, state, FitSettings(samples=(40, 40)), factor=4, extra=extra)
+    expected_points = [(1, 1, False)] * 3 if kind == "points" else [(3, 2, False), (3, 2, False), (2, 2, True)]
+    assert [dataclasses.astuple(points) for points in problem.points] == expected_points
     jac, rest_jac, by_circle, _ = problem.jacobian(state)
     x, first = problem.flat(state), 0
     for name, count in problem.blocks(p):
@@ -113,7 +129,7 @@ def test_known_lights_are_found_again(sensor: SensorSpec, known: tuple[Photograp
     as their labels hold them back, and images to a quarter of a level."""
     shots, true = known
     rng = np.random.default_rng(1)
-    moved = dataclasses.replace(true.p, leds=true.p.leds + rng.normal(size=true.p.leds.shape) * [2, 2, 1, 0.1, 0.1, 0.4, 0])
+    moved = dataclasses.replace(true.p, leds=true.p.leds + rng.normal(size=true.p.leds.shape) * [2, 2, 1, 0.1, 0.1, 0.4, 0, 0])
     labels = true.circles + rng.normal(size=(6, 3)) * 0.3
     settings = FitSettings(fixed=("gamma", "stray", "slope"), samples=(150, 100))
     start = FitState(moved, true.slopes, labels)
@@ -134,7 +150,7 @@ def test_five_starts_end_at_the_same_error(sensor: SensorSpec, known: tuple[Phot
     shots, true = known
     rng, errors = np.random.default_rng(2), []
     for _ in range(5):
-        moved = true.p.leds + rng.normal(size=true.p.leds.shape) * [1.5, 1.5, 1.0, 0.2, 0.2, 0.5, 0]
+        moved = true.p.leds + rng.normal(size=true.p.leds.shape) * [1.5, 1.5, 1.0, 0.2, 0.2, 0.5, 0, 0]
         problem = DirectFit(sensor, shots, true, FitSettings(fixed=("gamma",), samples=(150, 100)), factor=4)
         start = problem.inside_bounds(dataclasses.replace(true, p=dataclasses.replace(true.p, leds=moved)))
         errors.append(float(np.abs(problem.residuals(problem.solve(start, 100))[0]).mean()))
@@ -148,7 +164,7 @@ def test_the_ray_tracers_own_photographs_are_explained(sensor: SensorSpec) -> No
     train, test = shots.take(np.arange(8)), shots.take(np.arange(8, 10))
     p = LightParameters.of(sensor, shots.background)
     moved = dataclasses.replace(
-        p, leds=p.leds + np.random.default_rng(0).normal(size=p.leds.shape) * [1, 1, 0.3, 0.05, 0.05, 0.2, 0]
+        p, leds=p.leds + np.random.default_rng(0).normal(size=p.leds.shape) * [1, 1, 0.3, 0.05, 0.05, 0.2, 0, 0]
     )
     start = with_parameters(sensor, moved, shots.background)
     fitted = fit_lights(start, train, settings=FitSettings(fixed=("gamma",)), starts=1, rounds=2, device="cpu")
@@ -227,7 +243,7 @@ def test_ties_hold_at_mirrored_leds_and_nowhere_else(sensor: SensorSpec) -> None
             moved = [np.concatenate([leds.ravel(), x[p.leds.size :]]) for leds in (one, both)]
             assert np.abs(ties.off(moved[0])).max() > 0.2
             np.testing.assert_allclose(ties.off(moved[1]), 0, atol=1e-9)
-    for k in (7 * 2 + 5, 7 * 2 + 6, p.leds.size + 3 * 9):
+    for k in (8 * 2 + 5, 8 * 2 + 6, 8 * 2 + 7, p.leds.size + 3 * 9):
         assert np.abs(ties.off(x + 0.3 * np.eye(len(x))[k])).max() > 0.2
 
 
@@ -268,7 +284,12 @@ def test_extra_light_follows_leds_to_first_order(sensor: SensorSpec) -> None:
         assert held > 5e-5, f"column {column}: shadows must change"
         assert followed < held / 2, f"column {column} by {step}: {followed / held:.2f} of the change is missed"
     thin, thick = (
-        dataclasses.replace(state, p=dataclasses.replace(state.p, leds=np.column_stack([state.p.leds[:, :HEIGHT], [height] * 3])))
+        dataclasses.replace(
+            state,
+            p=dataclasses.replace(
+                state.p, leds=np.column_stack([state.p.leds[:, :HEIGHT], [height] * 3, state.p.leds[:, LENGTH]])
+            ),
+        )
         for height in (0.1, 0.6)
     )
     flat = extra_light(problem, thin, grid, "cpu", tracing)
@@ -309,7 +330,7 @@ def test_a_start_at_the_walls_is_a_sensor(sensor: SensorSpec) -> None:
 def test_the_prior_that_serves_presses_elsewhere_best_is_chosen(sensor: SensorSpec) -> None:
     """Lights that begin 3 mm from where they are: a prior that nails them there serves worse, and the choice says so."""
     shots, true = direct(sensor, circles(8))
-    moved = dataclasses.replace(true.p, leds=true.p.leds + np.array([3.0, 0, 0, 0, 0.3, 0, 0]))
+    moved = dataclasses.replace(true.p, leds=true.p.leds + np.array([3.0, 0, 0, 0, 0.3, 0, 0, 0]))
     start = with_parameters(sensor, moved, shots.background)
     settings = FitSettings(fixed=("gamma", "slope", "stray"))
     found, errors = choose_strength(start, shots, settings, candidates={"tied-dark": {"prior": 1e7}, "free": {"prior": 30.0}})

@@ -11,7 +11,7 @@ import pytest
 from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
 from raytac.calibrate.direct_light import ExtraLight, Light
 from raytac.calibrate.light_parameters import CEILING, VIRTUAL_CEILING
-from raytac.calibrate.ray_fit import fit_lights
+from raytac.calibrate.ray_fit import fit_lights, solve_direct
 from raytac.calibrate.start import leds_at_walls, leds_in_rows
 from raytac.errors import InputError, SpecError
 from raytac.gel.surface import GelSurface, make_grid
@@ -47,12 +47,12 @@ def test_lights_anywhere_between_coat_and_board_are_found_again(mini: SensorSpec
     validate_sensor(true_sensor)
     shots, true = direct(true_sensor, circles(6))
     rng = np.random.default_rng(8)
-    offset = rng.normal(size=true.p.leds.shape) * [1.5, 1.5, 0, 0.1, 0.1, 0.3, 0]
+    offset = rng.normal(size=true.p.leds.shape) * [1.5, 1.5, 0, 0.1, 0.1, 0.3, 0, 0]
     offset[:, 2] = -1.5
     start = FitState(dataclasses.replace(true.p, leds=true.p.leds + offset), true.slopes, true.circles)
     problem = DirectFit(true_sensor, shots, start, dataclasses.replace(SETTINGS, prior=1.0), factor=4)
     start = problem.inside_bounds(start)
-    found = problem.solve(start, 80)
+    problem, found = solve_direct(problem, start, 80)
     before, after = (np.abs(problem.residuals(state)[0]).mean() for state in (start, found))
     assert after < 0.25 < before, f"image error {before:.2f} to {after:.2f} levels"
     off = np.abs(found.p.leds[:, :3] - true.p.leds[:, :3])
@@ -84,7 +84,7 @@ def test_bounds_keep_virtual_sources_a_sensor(mini: SensorSpec) -> None:
     problem = DirectFit(mini, shots, state, SETTINGS, factor=4)
     rng = np.random.default_rng(1)
     for _ in range(40):
-        leds = state.p.leds + rng.normal(size=state.p.leds.shape) * [12, 12, 8, 2, 1, 0, 0]
+        leds = state.p.leds + rng.normal(size=state.p.leds.shape) * [12, 12, 8, 2, 1, 0, 0, 0]
         kept = problem.inside_bounds(dataclasses.replace(state, p=dataclasses.replace(state.p, leds=leds)))
         validate_sensor(dataclasses.replace(mini, lights=kept.p.lights(mini)))
 
@@ -156,7 +156,7 @@ def test_a_round_that_is_worse_is_taken_back_and_the_next_is_shorter(mini: Senso
 def test_held_problems_have_the_derivatives_of_their_cost(mini: SensorSpec) -> None:
     """One undamped step of a quadratic problem with strong anchors stays at them; without, it leaves."""
     shots, true = direct(moved_to(mini, -6.0), circles(5))
-    start = dataclasses.replace(true, p=dataclasses.replace(true.p, leds=true.p.leds + np.array([0.8, 0, 0, 0, 0, 0, 0])))
+    start = dataclasses.replace(true, p=dataclasses.replace(true.p, leds=true.p.leds + np.array([0.8, 0, 0, 0, 0, 0, 0, 0])))
     problem = DirectFit(mini, shots, start, SETTINGS, factor=4)
     free, held = (one.solve(start, 5) for one in (problem, problem.near(start, 1e9)))
     assert np.abs(free.p.leds - start.p.leds).max() > 0.3

@@ -9,6 +9,7 @@ import pytest
 
 from raytac.gel.surface import PadGrid
 from raytac.optics.trace.fast_tracer import total
+from raytac.optics.trace.quadrature import quadrature
 from raytac.specs.sensor import CameraSpec, LedSpec, LightsSpec, SensorSpec
 from tests.optics.conftest import Build
 from tests.optics.images import errors
@@ -208,3 +209,12 @@ def test_fast_and_reference_agree_on_shadows_of_strips(tracer: Build) -> None:
     mean, largest = errors(beside(fast), beside(sampled))
     assert mean < 0.02 and largest < 0.3, (mean, largest)
     assert beside(fast).mean() == pytest.approx(beside(sampled).mean(), rel=2e-3)
+
+
+def test_each_edge_has_the_points_that_it_needs() -> None:
+    """A strip of 22 mm three along; a tall LED whose height the camera sees foreshortened has its points over the height."""
+    assert quadrature(led("strip", (0.0, -12e-3, -6e-3), (0.0, 0.0, -4e-3), size=(22e-3, 1e-3))).by_edge == (3, 1)
+    for aim, upright in (((0.0, 0.0, -6e-3), False), ((0.0, -9e-3, 0.0), True)):
+        points = quadrature(led("tall", (0.0, -12e-3, -6e-3), aim, size=(2e-3, 6e-3)))
+        assert points.by_edge == (1, 2) and points.upright is upright
+        assert (points.along, points.across) == ((2, 1) if upright else (1, 2))

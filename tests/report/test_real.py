@@ -142,10 +142,7 @@ ONE_ROUND = ["--sides", "own", "--starts", "1", "--rounds", "1", "--prior", "tie
 
 
 def test_calibrate_writes_a_sensor_that_needs_no_photograph(of_itself: tuple[Path, np.ndarray], tmp_path: Path) -> None:
-    """What is written renders fitted presses to about a level, others to a few, wherever the folder is copied.
-
-    Six presses leave the three strips' lobes and places open: held-out presses are off by 3.4 levels in contacts.
-    """
+    """What is written renders fitted presses, and others, to about a level, wherever the folder is copied."""
     (data, background), made = of_itself, tmp_path / "made"
     mine = tmp_path / "mine" / "own.toml"
     mine.parent.mkdir()
@@ -157,8 +154,8 @@ def test_calibrate_writes_a_sensor_that_needs_no_photograph(of_itself: tuple[Pat
     shutil.rmtree(mine.parent)
     metrics = json.loads((out / "metrics.json").read_text("utf-8"))
     assert (metrics["presses.fitted"], metrics["presses.held_out"]) == (6, 3)
-    for key, most in {"fitted": 1.6, "fitted.alone": 1.6, "held_out": 3.6, "held_out.alone": 3.6}.items():
-        assert metrics[f"{key}.contact_mae"] < most and metrics[f"{key}.ring_mae"] < most / 2, (key, metrics)
+    for key, most in {"fitted": 1.1, "fitted.alone": 1.1, "held_out": 1.5, "held_out.alone": 1.5}.items():
+        assert metrics[f"{key}.contact_mae"] < most and metrics[f"{key}.ring_mae"] < 0.6, (key, metrics)
     written = load_sensor(out / "sensor.toml")
     assert all(len(found) == 28 for found in written.response.shading)
     assert (written.markers.rows, written.gelpad, written.marker_motion) == (1, SENSOR.gelpad, SENSOR.marker_motion)

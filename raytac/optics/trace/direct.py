@@ -7,34 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import numpy as np
 
 from raytac.optics.geometry import PixelSample
 from raytac.optics.refraction import Slab
 from raytac.optics.trace.led import Lamp
-from raytac.specs.sensor import CoatSpec, LedSpec
-
-SMALL = np.deg2rad(25.0)
-"""Angle up to which an LED's edge is one point of the quadrature."""
-STEP = np.deg2rad(70.0)
-"""Angle of an LED's edge that a further point covers."""
-
-
-def quadrature(led: LedSpec, refinement: int = 1) -> tuple[int, int]:
-    """Number of points over the longer and the shorter edge of ``led``, by their angles.
-
-    The angles are those seen from the place of the gel plane over the LED. ``refinement`` multiplies both numbers.
-    """
-    distance = max(abs(led.position[2]), 1e-6)
-    angles = [2 * float(np.arctan(edge / 2 / distance)) for edge in sorted(led.size, reverse=True)]
-    along, across = (refinement * (1 if angle <= SMALL else 1 + int(np.ceil(angle / STEP))) for angle in angles)
-    return along, across
-
-
-def gauss(count: int) -> list[tuple[float, float]]:
-    """Places and weights of the Gauss-Legendre rule of ``count`` points on [0, 1]."""
-    places, weights = np.polynomial.legendre.leggauss(count)
-    return [(0.5 + 0.5 * float(x), 0.5 * float(w)) for x, w in zip(places, weights, strict=True)]
+from raytac.optics.trace.quadrature import EdgePoints, gauss
+from raytac.specs.sensor import CoatSpec
 
 
 @dataclass(frozen=True)
@@ -76,7 +54,7 @@ def direct_light(
     coat: CoatSpec,
     seen: PixelSample,
     lamp: Lamp,
-    points: tuple[int, int],
+    points: EdgePoints,
     specular: bool = True,
     slab: Slab | None = None,
 ) -> tuple[Any, Any]:
@@ -86,8 +64,8 @@ def direct_light(
     point is the LED's middle. Radiance is that at the coat, without cast shadows.
     """
     diffuse, mirror = mi.Float(0), mi.Float(0)
-    for u, weight in _along(mi, lamp, seen, points[0]):
-        for place, share in gauss(points[1]):
+    for u, weight in _along(mi, lamp, seen, points.along):
+        for place, share in gauss(points.across):
             light = arrival(mi, seen, lamp, lamp.point(u, 2 * place - 1), slab)
             gain = light.gain * weight * share
             diffuse += gain

@@ -26,9 +26,10 @@ from raytac.optics.geometry import CoatField, CoatLayout, PixelSample, see
 from raytac.optics.ink import ink_at, inked_albedo
 from raytac.optics.response import mid_grey_exposure
 from raytac.optics.trace.config import RayTraced
-from raytac.optics.trace.direct import direct_light, quadrature
+from raytac.optics.trace.direct import direct_light
 from raytac.optics.trace.interreflection import BounceField, CaseLight
 from raytac.optics.trace.led import Lamp
+from raytac.optics.trace.quadrature import quadrature
 from raytac.optics.trace.scene import SensorScene
 from raytac.optics.trace.shadow import ShadowGrid
 from raytac.optics.trace.tracer import Tracer, total

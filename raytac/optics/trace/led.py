@@ -12,6 +12,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from raytac.optics.trace.quadrature import quadrature
 from raytac.specs.sensor import LedSpec
 
 PLUGIN = "raytac_led"
@@ -72,7 +73,7 @@ class Lamp:
     def from_spec(cls, mi: Any, led: LedSpec, unit: float = 1.0) -> Lamp:
         """The LED in ``unit`` length units per metre; power grows with unit², so that I / r² stays."""
         halves = [0.5 * unit * length * edge for length, edge in zip(led.size, np.array(led.edges), strict=True)]
-        if np.hypot(*halves[1][:2]) > np.hypot(*halves[0][:2]):
+        if quadrature(led).upright:
             halves.reverse()
         lamp = cls(
             centre=mi.Point3f([unit * c for c in led.position]),
