@@ -201,7 +201,18 @@ class Potential:
     def touch(self, active: wp.array) -> None:
         """Contacts, their forces and rows at x."""
         self.collision.assemble(
-            *(self.x, self.x_start, self.R, self.t, self.kappa, self.friction_eps, self.last, active, self.vert_gradient, self.barrier)
+            *(
+                self.x,
+                self.x_start,
+                self.R,
+                self.t,
+                self.kappa,
+                self.friction_eps,
+                self.last,
+                active,
+                self.vert_gradient,
+                self.barrier,
+            )
         )
 
     def assemble(self, active: wp.array) -> None:

@@ -103,7 +103,9 @@ class StepState:
         self.decisions, self.flags = Decisions(), Flags()
         self._arrays: list[tuple[list[str], wp.array]] = []
         for dtype in (wp.int32, wp.float64):
-            names = [name for name, field in Decisions.vars.items() if field.type.dtype is dtype and name not in ("project", "last")]
+            names = [
+                name for name, field in Decisions.vars.items() if field.type.dtype is dtype and name not in ("project", "last")
+            ]
             rows = wp.zeros((len(names), batch), dtype=dtype, device=device)
             self._arrays.append((names, rows))
             for k, name in enumerate(names):

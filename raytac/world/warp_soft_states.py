@@ -50,7 +50,12 @@ class WarpSoftStates:
         self._sites = np.array([composed.model.site(m.site).id for m in composed.sensors], int)
         cases = np.repeat(site_poses([self.first()], self._sites), num_envs, axis=0)
         self.pads = WarpSoftPads(
-            composed, self.world, cases, physics=physics, coupling=coupling, device="cuda" if self.world.engine.device.is_cuda else "cpu"
+            composed,
+            self.world,
+            cases,
+            physics=physics,
+            coupling=coupling,
+            device="cuda" if self.world.engine.device.is_cuda else "cpu",
         )
         self._reader = self.world.engine.reader(state_numbers(composed))
         self.failed = np.zeros(num_envs, bool)
