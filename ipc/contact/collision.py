@@ -250,6 +250,7 @@ class Collision:
         t: wp.array,
         kappa: wp.array,
         friction_eps: float,
+        last: wp.array,
         active: wp.array,
         gradient: wp.array,
         energy: wp.array,
@@ -263,7 +264,7 @@ class Collision:
         if self.planes:
             self._each(normal.contact_plane, [x, self.surface, R, t, kappa, active], outputs)
         if self.friction:
-            self._each(friction.friction_rows, [x, start, self.lagged, friction_eps, active], [gradient, self.contacts])
+            self._each(friction.friction_rows, [x, start, self.lagged, friction_eps, last, active], [gradient, self.contacts])
         self._launch(contacts.check_contacts, self.batch, [self.contacts], [self.overflow])
 
     def energy_change(

@@ -427,6 +427,7 @@ def friction_rows(
     start: VecArray2d,
     lagged: Lagged,
     eps: wp.float64,
+    last: FloatArray,
     active: IntArray,
     lanes: wp.int32,
     # outputs
@@ -457,7 +458,10 @@ def friction_rows(
                 axis = wp.vec3d(wp.float64(0.0), wp.float64(1.0), wp.float64(0.0))
             along = wp.normalize(axis - wp.dot(axis, n) * n)
         across = wp.cross(n, along)
-        p, q = wp.sqrt(limit * friction_curvature(y, eps)), wp.sqrt(limit * ratio)
+        # Where Newton's steps are longer than the slip, the law's curvature says nothing of where they lead. The paraboloid that touches
+        # the law at y lies above it everywhere (a majoriser: Hunter and Lange, A tutorial on MM algorithms, Am. Stat. 58, 2004).
+        curvature = wp.where(y < last[env], ratio, friction_curvature(y, eps))
+        p, q = wp.sqrt(limit * curvature), wp.sqrt(limit * ratio)
         if p > wp.float64(0.0):
             push_row(out, env, verts, (p * c[0]) * along, (p * c[1]) * along, (p * c[2]) * along, (p * c[3]) * along)
         push_row(out, env, verts, (q * c[0]) * across, (q * c[1]) * across, (q * c[2]) * across, (q * c[3]) * across)

@@ -22,6 +22,8 @@ SLOW = wp.constant(wp.float64(0.505))
 
 Half of it, and some rounding.
 """
+RENEWED = wp.constant(wp.int32(20))
+"""Most Newton iterations of a step's first solve after which friction is renewed."""
 
 
 @wp.kernel
@@ -48,6 +50,7 @@ def start_step(friction: wp.int32, d: Decisions, f: Flags):
     d.line_search[env] = 0
     d.project[env] = 0
     d.speed[env] = zero
+    d.last[env] = zero
     d.ccd[env] = wp.float64(1.0)
     d.min_gap[env] = wp.float64(wp.inf)
     d.min_det[env] = wp.float64(wp.inf)
@@ -93,8 +96,11 @@ def after_lag(tolerance: wp.float64, max_relags: wp.int32, d: Decisions, f: Flag
     d.settled[env] = d.lagging[env]
     if d.lagging[env] == 0:
         return
-    f.settled[0] = 1
     d.pending[env] = 0
+    if d.active[env] != 0:  # within the first solve, whose end is judged
+        d.settled[env] = 0
+        return
+    f.settled[0] = 1
     if d.relags[env] >= 0:
         if d.changed[env] <= tolerance or (2 * d.relags[env] >= max_relags and d.sum_changed[env] <= tolerance):
             return
@@ -322,6 +328,7 @@ def conclude(tolerance: wp.float64, max_newton: wp.int32, max_relags: wp.int32, 
         d.newton[env] = d.newton[env] + 1
         d.since_lag[env] = d.since_lag[env] + 1
         d.linear[env] = d.linear[env] + d.pcg_iterations[env]
+        d.last[env] = d.size[env]
     if d.plain[env] != 0:
         d.ready[env] = 1
         slow = d.speed[env] <= tolerance
@@ -339,6 +346,10 @@ def conclude(tolerance: wp.float64, max_newton: wp.int32, max_relags: wp.int32, 
                 d.active[env] = 0
     if was_active != 0 and d.since_lag[env] >= max_newton:
         d.active[env] = 0
+    # Friction of a step's first solve follows its contacts: solved with that of the step's start, it would be solved for nothing.
+    if friction != 0 and max_relags > 0 and d.plain[env] != 0 and d.active[env] != 0 and d.relags[env] == 0:
+        if d.since_lag[env] <= RENEWED:
+            d.pending[env] = 1
     # Where Newton gave up, forces are no better known after another lag; the first two may still help it on.
     if was_active != 0 and d.active[env] == 0 and friction != 0 and max_relags > 0:
         if d.converged[env] != 0 or (d.relags[env] < 2 and d.relags[env] < max_relags):

@@ -45,7 +45,7 @@ class Newton:
     def __init__(self, potential: Potential, layout: Layout, settings: Settings) -> None:
         self.potential, self.settings = potential, settings
         self.batch, self.device = potential.batch, potential.device
-        self.state = StepState(self.batch, potential.project, potential.collision.overflow, self.device)
+        self.state = StepState(self.batch, potential.project, potential.last, potential.collision.overflow, self.device)
         nodes, lanes = len(layout.node_rest), potential.collision.lanes
         self.pcg = Pcg(self.batch, nodes, lanes, self.device)
         self.preconditioner = make_preconditioner(layout, settings, self.batch, lanes, self.device)

@@ -103,6 +103,7 @@ class Potential:
         self.node_change, self.force_size, self.vert_size = numbers(batch, nodes), numbers(batch, nodes), numbers(batch, verts)
         self.reach, self.barrier, self.elastic_energy, self.kinetic = (numbers() for _ in range(4))
         self.collision.measure_from(self.x_start, self.y_start, (self.frame_q, self.frame_p), (self.goal_q, self.goal_p))
+        self.last = wp.zeros(batch, dtype=wp.float64, device=device)  # size of the Newton step before [m]
         self.project = wp.zeros(batch, dtype=wp.int32, device=device)
         self.everyone = wp.full(batch, 1, dtype=wp.int32, device=device)
 
@@ -200,7 +201,18 @@ class Potential:
     def touch(self, active: wp.array) -> None:
         """Contacts, their forces and rows at x."""
         self.collision.assemble(
-            *(self.x, self.x_start, self.R, self.t, self.kappa, self.friction_eps, active, self.vert_gradient, self.barrier)
+            *(
+                self.x,
+                self.x_start,
+                self.R,
+                self.t,
+                self.kappa,
+                self.friction_eps,
+                self.last,
+                active,
+                self.vert_gradient,
+                self.barrier,
+            )
         )
 
     def assemble(self, active: wp.array) -> None:

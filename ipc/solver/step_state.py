@@ -56,6 +56,7 @@ class Decisions:
     noise: FloatArray  # of the energy, by rounding
     trial_det: FloatArray  # least det F of the step that is tried
     size: FloatArray  # of the Newton step
+    last: FloatArray  # size of the Newton step before; 0 in a step's first
     slack: FloatArray  # share of a gap that has to stay
     floor: FloatArray  # gap that has to stay
     changed: FloatArray  # share of the friction forces that the last lag changed
@@ -93,20 +94,23 @@ class StepState:
 
     Args:
         project: mask of environments whose Hessian is made definite (B,).
+        last: largest displacement of a node in the last Newton step (B,) [m]; 0 before the first.
         halt: flag that stops everything until buffers have grown.
     """
 
-    def __init__(self, batch: int, project: wp.array, halt: wp.array, device: wp.Device) -> None:
+    def __init__(self, batch: int, project: wp.array, last: wp.array, halt: wp.array, device: wp.Device) -> None:
         self.batch, self.device = batch, device
         self.decisions, self.flags = Decisions(), Flags()
         self._arrays: list[tuple[list[str], wp.array]] = []
         for dtype in (wp.int32, wp.float64):
-            names = [name for name, field in Decisions.vars.items() if field.type.dtype is dtype and name != "project"]
+            names = [
+                name for name, field in Decisions.vars.items() if field.type.dtype is dtype and name not in ("project", "last")
+            ]
             rows = wp.zeros((len(names), batch), dtype=dtype, device=device)
             self._arrays.append((names, rows))
             for k, name in enumerate(names):
                 setattr(self.decisions, name, rows[k])
-        self.decisions.project = project
+        self.decisions.project, self.decisions.last = project, last
         names = [name for name in Flags.vars if name != "halt"]
         self._flags = wp.zeros(len(names), dtype=wp.int32, device=device)
         for k, name in enumerate(names):

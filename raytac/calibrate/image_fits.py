@@ -18,7 +18,8 @@ from raytac.calibrate.photographs import Photographs, decode
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, make_grid
 from raytac.optics.image.config import Phong
-from raytac.optics.image.mlp_weights import INPUTS, LEVELS, MlpWeights, inputs, view_size, view_slope
+from raytac.optics.image.mlp_weights import INPUTS, LEVELS, MlpWeights, inputs, view_slope
+from raytac.optics.image.network_files import view_size
 from raytac.optics.response import fit_log_gain
 from raytac.optics.taxim.bake.fit import BinSums, two_sheets
 from raytac.optics.taxim.bake.settings import PLAIN, BakeSettings

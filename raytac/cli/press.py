@@ -44,13 +44,13 @@ class PressArgs(ShadowOptions, SolverOptions):
     level: Annotated[str | None, named(PADS)] = None
     """Resolution of a soft pad's mesh, makes physics ipc; as the scene says, else coarse."""
     optics: Annotated[str, named(OPTICS.names)] = "raytrace"
-    """Optical mode: raytrace, taxim (a table, baked at first use), phong or mlp (a network).
+    """Optical mode: raytrace, taxim (a table, baked at first use), phong, mlp or unet (networks).
 
-    A --calibration replaces the baked table; mlp needs weights. The options below that a mode has are fields of its configuration."""
+    A --calibration replaces the baked table; networks need weights. The options below that a mode has are fields of its configuration."""
     calibration: Path | None = None
     """taxim: calibration folder, as raytac bake writes; the sensor's baked table if not given."""
     weights: Path | None = None
-    """mlp: folder of raytac calibrate DATASET --model mlp."""
+    """mlp: folder of raytac calibrate DATASET --model mlp; unet: of experiments/train_unet.py."""
     markers: Annotated[str | None, named(MARKERS.names)] = None
     """Model that moves the sensor's markers; surface needs physics ipc. None if not given.
 

@@ -10,8 +10,14 @@ from .image.config import PHONG_LIGHTS as PHONG_LIGHTS
 from .image.config import Mlp as Mlp
 from .image.config import Phong as Phong
 from .image.config import PhongLight as PhongLight
+from .image.config import Unet as Unet
 from .image.mlp import MlpMode as MlpMode
 from .image.phong import PhongMode as PhongMode
+from .image.unet import UnetMode as UnetMode
+from .image.unet_network import UnetNetwork as UnetNetwork
+from .image.unet_weights import UnetWeights as UnetWeights
+from .image.unet_weights import load_unet as load_unet
+from .image.unet_weights import save_unet as save_unet
 from .registry import OPTICS as OPTICS
 from .registry import register as register
 from .runtime import load_mitsuba as load_mitsuba

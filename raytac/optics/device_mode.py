@@ -283,7 +283,11 @@ class DeviceMode(ABC):
         others = ({"contact": contact} if self.needs_contact else {}) | ({} if ink is None else {"ink": ink})
         self._check_batch(device_envs(self.layout.nx * self.layout.ny, heights, **others), self._grid)
         with RENDERER:
-            return DeviceFrame(*self._recorded(self._frame, heights, contact if self.needs_contact else None, ink))
+            return self._made(heights, contact if self.needs_contact else None, ink)
+
+    def _made(self, heights: Float, contact: UInt8 | None, ink: Float | None) -> DeviceFrame:
+        """Images of checked arrays; a mode that is not Dr.Jit code alone makes them by itself."""
+        return DeviceFrame(*self._recorded(self._frame, heights, contact, ink))
 
     def _images(
         self, surface: GelSurface, failed: np.ndarray, lit: DeviceFrame | dict[str, Any] | None, seen: tuple[Any, Any] | None

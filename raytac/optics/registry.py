@@ -13,6 +13,7 @@ OPTICS: Registry[OpticsConfig[OpticalMode]] = Registry(
         "taxim": "raytac.optics.taxim.config:Taxim",
         "phong": "raytac.optics.image.config:Phong",
         "mlp": "raytac.optics.image.config:Mlp",
+        "unet": "raytac.optics.image.config:Unet",
     },
 )
 register = OPTICS.register

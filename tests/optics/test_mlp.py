@@ -23,9 +23,9 @@ from raytac.optics.image.mlp_weights import (
     inputs,
     load_mlp,
     save_mlp,
-    view_size,
     view_slope,
 )
+from raytac.optics.image.network_files import view_size
 from raytac.sensor import TactileSensor
 from tests.conftest import make_sensor_spec
 from tests.optics.scenes import ball, grid_of, surface

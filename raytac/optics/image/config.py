@@ -1,4 +1,4 @@
-"""Configurations of Phong's model and of the network. Importing them loads no renderer."""
+"""Configurations of Phong's model and of the networks. Importing them loads no renderer."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from raytac.specs.sensor import Vec3
 
 if TYPE_CHECKING:
     from raytac.optics.image.mlp_weights import MlpWeights
+    from raytac.optics.image.unet_weights import UnetWeights
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,26 @@ class Mlp(OpticsConfig[Any]):
 
     def maker(self) -> Any:
         return import_module("raytac.optics.image.mlp").MlpMode
+
+    @classmethod
+    def variants(cls) -> tuple[Variant, ...]:
+        return ()  # there is no network that every sensor could be compared with
+
+
+@dataclass(frozen=True)
+class Unet(OpticsConfig[Any]):
+    """A small U-Net from the coat to the whole image, which may learn shadows; no default."""
+
+    weights: str | Path | UnetWeights | None = None
+    """The network, its file, or the folder of ``experiments/train_unet.py``."""
+
+    def __post_init__(self) -> None:
+        if self.weights is None:
+            rule = "must name a network, as `python experiments/train_unet.py` writes it: optics=Unet(weights=…)"
+            raise InputError("weights", rule=rule)
+
+    def maker(self) -> Any:
+        return import_module("raytac.optics.image.unet").UnetMode
 
     @classmethod
     def variants(cls) -> tuple[Variant, ...]:

@@ -7,16 +7,13 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from raytac.errors import InputError
 from raytac.gel.surface import PadGrid
 from raytac.optics.device_mode import Float, UInt8
 from raytac.optics.image.base import ImageHeights, ImageMode
 from raytac.optics.image.config import Mlp
-from raytac.optics.image.mlp_weights import LEVELS, MlpWeights, forward, inputs, load_mlp, view_size, view_slope
+from raytac.optics.image.mlp_weights import LEVELS, MlpWeights, forward, inputs, load_mlp, view_slope
+from raytac.optics.image.network_files import check_view
 from raytac.optics.taxim.mode import padded, resized
-
-_VIEW_TOLERANCE = 0.01
-"""By which share the view may differ from that of the sensor that a network was fitted to."""
 
 
 class MlpMode(ImageMode):
@@ -31,23 +28,12 @@ class MlpMode(ImageMode):
         weights = self.config.weights
         assert weights is not None
         self.weights = weights if isinstance(weights, MlpWeights) else load_mlp(weights)
-        self._check_view()
+        check_view("mlp", self.sensor, self.weights.view, self.weights.provenance)
         self._view = view_slope(self.sensor)
 
     @property
     def _crops(self) -> bool:
         return True
-
-    def _check_view(self) -> None:
-        """Raise InputError if the network is of another view: places are among its inputs."""
-        own, fitted = view_size(self.sensor), self.weights.view
-        if fitted is None or max(abs(a / b - 1) for a, b in zip(own, fitted, strict=True)) <= _VIEW_TOLERANCE:
-            return
-        theirs, mine = (f"{1e3 * w:.2f} mm x {1e3 * h:.2f} mm" for w, h in (fitted, own))
-        name = self.weights.provenance.get("sensor", "unknown")
-        rule = f"was fitted to the sensor {name!r}, which sees {theirs}"
-        rule += f": {self.sensor.name!r} sees {mine} and needs a network of its own"
-        raise InputError("weights", value="mlp", rule=rule)
 
     def _place(self, ops: Any, column: Any, row: Any) -> tuple[Any, Any]:
         width, height = self.camera.resolution

@@ -13,7 +13,6 @@ places by heart where presses are few. Between layers stands ReLU, and the outpu
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from raytac.errors import CalibrationError
+from raytac.optics.image.network_files import check_header, file_provenance, file_view, header_arrays
 from raytac.optics.taxim.restricted_pickle import check_file_numbers, npz_arrays, npz_names
 from raytac.specs.sensor import SensorSpec
 
@@ -44,12 +44,6 @@ class MlpWeights:
     """``sensor`` names the sensor that it was fitted to."""
     view: tuple[float, float] | None = None
     """Width and height of the pad in that sensor's view [m]; None where it is not known."""
-
-
-def view_size(sensor: SensorSpec) -> tuple[float, float]:
-    """Width and height of the pad in a sensor's view [m]."""
-    width, height = (n * p for n, p in zip(sensor.camera.resolution, sensor.camera.pixel_pitch, strict=True))
-    return width, height
 
 
 def view_slope(sensor: SensorSpec) -> tuple[float, float]:
@@ -82,9 +76,7 @@ def save_mlp(weights: MlpWeights, path: Path) -> None:
     """Write the network as an ``.npz``."""
     arrays: dict[str, Any] = {f"matrix_{k}": m.astype(np.float32) for k, m in enumerate(weights.matrices)}
     arrays |= {f"offset_{k}": b.astype(np.float32) for k, b in enumerate(weights.offsets)}
-    if weights.view is not None:
-        arrays["view"] = np.array(weights.view)
-    arrays |= {"format": FORMAT, "version": np.int64(VERSION), "provenance": json.dumps(weights.provenance)}
+    arrays |= header_arrays(FORMAT, VERSION, weights.provenance, weights.view)
     np.savez(path, background=weights.background.astype(np.float32), **arrays)
 
 
@@ -94,7 +86,7 @@ def load_mlp(path: str | Path) -> MlpWeights:
     path = path / "mlp.npz" if path.is_dir() else path
     if not path.is_file():
         raise CalibrationError("must be a file mlp.npz, or a folder that holds one", file=path)
-    _check_version(path)
+    check_header(path, FORMAT, VERSION, "`raytac calibrate DATASET --model mlp` fits it again", unmarked="matrix_0")
     count = sum(name.startswith("matrix_") for name in npz_names(path))
     if not 1 <= count <= 16:
         raise CalibrationError("must hold 1 to 16 layers, matrix_0 and on", file=path, value=count)
@@ -112,41 +104,4 @@ def load_mlp(path: str | Path) -> MlpWeights:
     if background.ndim != 3 or background.shape[2] != 3 or min(background.shape[:2]) < 3:
         raise CalibrationError("must have shape (H, W, 3)", file=path, key="background", value=background.shape)
     check_file_numbers(path, "background", background, background.shape)
-    return MlpWeights(tuple(matrices), tuple(offsets), background.astype(np.float32), _provenance(path), _view(path))
-
-
-def _check_version(path: Path) -> None:
-    names = npz_names(path)
-    arrays = npz_arrays(path, tuple(name for name in ("format", "version") if name in names))
-    header = {name: str(a.reshape(())) if a.size == 1 else f"{a.dtype} {a.shape}" for name, a in arrays.items()}
-    if not header and "matrix_0" in names:
-        header = {"format": FORMAT, "version": "0, of before files said it"}
-    for key, expected in (("format", FORMAT), ("version", str(VERSION))):
-        if header.get(key) != expected:
-            rule = (
-                f"must be {expected!r}, which this raytac reads and writes: `raytac calibrate DATASET --model mlp` fits it again"
-            )
-            raise CalibrationError(rule, file=path, key=key, value=header.get(key, "missing"))
-
-
-def _provenance(path: Path) -> dict[str, str]:
-    """Provenance that the file states; empty if it states none."""
-    if "provenance" not in npz_names(path):
-        return {}
-    text = npz_arrays(path, ("provenance",))["provenance"]
-    try:
-        provenance = json.loads(str(text)) if text.dtype.kind == "U" and text.shape == () else None
-    except (ValueError, RecursionError):
-        provenance = None
-    if not isinstance(provenance, dict) or not all(isinstance(value, str) for value in provenance.values()):
-        raise CalibrationError("must be a JSON object of texts", file=path, key="provenance", value=str(text)[:80])
-    return provenance
-
-
-def _view(path: Path) -> tuple[float, float] | None:
-    if "view" not in npz_names(path):
-        return None
-    width, height = check_file_numbers(path, "view", npz_arrays(path, ("view",))["view"], (2,)).tolist()
-    if min(width, height) <= 0:
-        raise CalibrationError("must be two lengths > 0 [m]", file=path, key="view", value=(width, height))
-    return width, height
+    return MlpWeights(tuple(matrices), tuple(offsets), background.astype(np.float32), file_provenance(path), file_view(path))

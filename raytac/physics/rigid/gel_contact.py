@@ -15,6 +15,7 @@ from raytac.physics.rigid.lift_kernels import TOGETHER, Lifts
 from raytac.physics.rigid.load_law import shear_modulus
 from raytac.physics.rigid.motion_kernels import Frames, move_bodies, pair_of_gels
 from raytac.physics.rigid.pierced import BondedFaces
+from raytac.physics.rigid.response_kernels import Response
 from raytac.physics.rigid.row_kernels import read_rows, set_rows, sum_wrenches
 from raytac.physics.rigid.search import PadSearch
 from raytac.physics.rigid.shear_state import ShearState
@@ -61,7 +62,7 @@ class GelContact:
         search: for contacts of bodies.
         frames: frames, velocities and free accelerations of n environments, which ``begin`` reads.
         motion, steps, slots: motion, environments and contacts of the step.
-        lifts: inputs of ``solve_lifts`` after ``velocity``.
+        lifts: search for the lifts of slides that begin or end, after ``expect_lifts``.
         force, velocity: of the rows at the end of the step, (B, pads, bodies + pads, ROWS), which ``end`` reads.
         before: ``pad_from_body`` (B, pads, bodies) at the last step, which ``move`` renews; NaN where unknown.
         wrenches: on the pads (B, pads).
@@ -118,13 +119,9 @@ class GelContact:
         self._struct(self.slots, (*slots, world.ROWS), {"force": wp.float64, "regularisation": wp.float64})
         self.steps = self._struct(world.Steps(), (num_envs,), _STEPS)
         together = min(pads * (count + pads), TOGETHER)
-        lifts = self._struct(Lifts(), (num_envs, together), {"slot": wp.vec2i, "reach": wp.float64})
-        self._struct(lifts, (num_envs, 2, together), {"lift": wp.float64, "lacks": wp.float64})
-        lifts.carrier = self._gels.carrier
-        lifts.least = self._zeros((num_envs,), wp.float64)
-        lifts.jacobian = self._zeros((num_envs, together, together), wp.float64)
-        lifts.work = self._zeros((num_envs, together, 2 * together), wp.float64)
-        self.lifts: list[Any] = [lifts, self.numbers]
+        self.lifts: Any = self._struct(Lifts(), (num_envs, together), {"slot": wp.vec2i, "best": wp.float64})
+        self._struct(self.lifts, (num_envs, world.ROWS * together), {"free": wp.float64, "force": wp.float64})
+        self.lifts.least = self._zeros((num_envs,), wp.float64)
         self.force, self.velocity = (self._zeros((*slots, world.ROWS), wp.float64) for _ in range(2))
         self.acceleration, self.rolling = self._zeros(slots, wp.float64), self._zeros(slots, wp.vec2d)
         self.wrenches = self._zeros(all_pads, wp.spatial_vectord)
@@ -142,17 +139,21 @@ class GelContact:
         for search, _, _ in self._searches:
             search.reserve(search.pairs)
 
-    def expect_lifts(self, solves: int, share: np.ndarray, inverse_weight: np.ndarray) -> None:
-        """Name the most solves for ``lifts``; see ``Lifts``.
+    def expect_lifts(self, solves: int, nv: int) -> None:
+        """Make room for ``lifts``.
 
         Args:
-            share: of bodies of the model, (nbody,).
-            inverse_weight: ``body_invweight0`` (nbody, 2).
+            solves: most solves of MuJoCo's for them.
+            nv: degrees of freedom of the model.
         """
-        lifts, touched, turning = self.lifts[0], self.numbers.carrier.numpy()[: self._touched.bodies], np.zeros(len(share))
-        turning[touched] = inverse_weight[touched, 1] / np.maximum(inverse_weight[touched, 0], np.finfo(float).tiny)
-        lifts.solves, lifts.share = solves, _array(share, wp.float64, self.device)
-        lifts.turning = _array(turning, wp.float64, self.device)
+        num_envs, together = self.lifts.slot.shape
+        response: Any = Response()
+        response.mass = self._zeros((num_envs, nv, nv), wp.float64)
+        response.rows = self._zeros((num_envs, world.ROWS * together, nv), wp.float64)
+        response.other = self._zeros((num_envs, world.ROWS, nv), wp.float64)
+        response.own = self._zeros((num_envs, world.ROWS * together), wp.float64)
+        response.state = self._zeros((num_envs, nv), wp.float64)
+        self.lifts.solves, self.lifts.response = solves, response
 
     def begin(self, *, whole: bool = False) -> None:
         """Find contacts from ``frames``, choose steps (unless ``whole``), and set the rows."""
@@ -329,7 +330,6 @@ _SLOTS: dict[str, Any] = {
     "place": wp.vec3d,
     "frame": wp.mat33d,
     "bend": wp.vec2d,
-    "arm": wp.vec3d,
     "lift": wp.float64,
     "wrench": wp.spatial_vectord,
     "opposite": wp.spatial_vectord,

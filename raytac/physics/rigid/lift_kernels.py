@@ -1,16 +1,16 @@
 """Lifts of slides that begin or end, of all contacts of an environment at once.
 
 A lift ℓ fits if MuJoCo's convex cone gives back the normal force N of the law: ℓ = μ r (T − μ N), r = G / G_t the ratio of the dampings,
-N and the friction T of the rows without a cone, at MuJoCo's speeds for the end of the step. Contacts of one body feel each other. A lift
-that grows by Δℓ changes MuJoCo's normal forces by Δp, and these the speeds by Δt C d Δp, d the direction of normal force and friction
-together:
+N and the friction T of the rows without a cone, at MuJoCo's speeds for the end of the step. Contacts of one body feel each other.
 
-    Δℓ = −P Δp,  P = D + Δt G d·C d,    D = 1 + μ² r
-    Δ(μ r (T − μ N) − ℓ) = Q Δp,        Q = D (1 + Δt G n·C d)
+Each solve of MuJoCo's gives velocities v and forces p of the rows. Their response W to other forces is known (``response_kernels``), so
+the law of all contacts is solved with v − W p + W q for the velocities under forces q:
 
-with C the inverse mass and inertia that two contacts share, those of bodies alone. −Q P⁻¹ begins the Jacobian. Each solve of MuJoCo's then
-corrects its rows by Schubert's update, in the columns that C couples (L. K. Schubert, Math. Comp. 24, 1970): of one contact that is the
-secant method.
+    N = max(f₀ − G v_n, 0),   |q_t| ≤ μ N,   q_t = f₀ − G_t v_t  unless that is beyond the cone,
+
+by Gauss and Seidel's method over contacts, in each the normal force before friction (M. Jean, The non-smooth contact dynamics method,
+Comput. Methods Appl. Mech. Eng. 177, 1999). The lifts follow from its velocities. With them MuJoCo's next solve has the law's forces,
+unless other constraints change their state meanwhile: then one more solve follows.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -22,7 +22,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.physics.rigid.world_kernels import ROWS, Differences, Slots, Steps
+from raytac.physics.rigid.response_kernels import Response, add_force, factorise, vec6d, velocity_by
+from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
@@ -33,18 +34,21 @@ Others keep that of the start of the step.
 """
 
 _FITS = wp.constant(wp.float64(0.005))
-"""Error of a lift over the normal force that is left."""
+"""Error of a lift over the normal force at which it fits."""
 _FALLS = wp.constant(wp.float64(0.5))
-"""Share to which the error must have fallen for a last step that no solve checks."""
-_FARTHEST = wp.constant(wp.float64(2.0))
-"""Longest change of a lift, over that of a contact alone with all error of the environment."""
+"""Share to which the error must have fallen for lifts that no solve checks."""
+_SWEEPS = wp.constant(wp.int32(300))
+"""Most sweeps over the contacts; some thirty suffice for two pads."""
+_INNER = wp.constant(wp.int32(3))
+"""Solves of one contact in a sweep."""
+_SETTLED = wp.constant(wp.float64(2e-7))
+"""Change of a force in a sweep, over the greatest normal force, at which sweeps end."""
 LEAST_FRICTION = wp.constant(wp.float64(1e-6))
 """Least coefficient of friction, which MuJoCo wants positive."""
-_LEAST_FORCE = wp.constant(wp.float64(1e-6))
-"""Least force [N] that another is divided by."""
 _ROWS = wp.constant(wp.int32(ROWS))
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
+_HALF = wp.constant(wp.float64(0.5))
 
 
 @wp.struct
@@ -55,231 +59,176 @@ class Lifts:
     """Most solves of MuJoCo's before that of the step."""
     least: wp.array(dtype=wp.float64)
     """Least error of all lifts so far [N], (n,)."""
-    carrier: wp.array(dtype=wp.int32)
-    """Body of the model that carries each pad, (pads,)."""
-    share: wp.array(dtype=wp.float64)
-    """Share of the acceleration of each body that comes.
-
-    It is less than 1 as damping is implicit (``ImplicitDamping``).
-    """
-    turning: wp.array(dtype=wp.float64)
-    """Mass over inertia of the bodies of the model that pads touch [1/m²], of others 0."""
     slot: wp.array2d(dtype=wp.vec2i)
     """Pad and body of each contact, (n, K)."""
-    reach: wp.array2d(dtype=wp.float64)
-    """Change of a contact's lift over its error, if it were alone."""
-    lift: wp.array3d(dtype=wp.float64)
-    """Of the best solve and of the present one [N], (n, 2, K)."""
-    lacks: wp.array3d(dtype=wp.float64)
-    """By how much it is too small [N], likewise."""
-    jacobian: wp.array3d(dtype=wp.float64)
-    """Changes of ``lacks`` over those of lifts, (n, K, K)."""
-    work: wp.array3d(dtype=wp.float64)
-    """(n, K, 2 K)."""
-
-
-@wp.struct
-class Slide:
-    """A contact as it slides by the end of the step."""
-
-    lacks: wp.float64
-    """By how much the lift is too small [N]."""
-    normal: wp.float64
-    """Normal force of the law [N]."""
-    push: wp.vec3d
-    """Direction of normal force and friction over the normal force, world frame."""
-    cone: wp.float64
-    """D."""
+    best: wp.array2d(dtype=wp.float64)
+    """Lifts of the solve of least error [N], (n, K)."""
+    free: wp.array2d(dtype=wp.float64)
+    """Velocities of the rows at the end of the step without their forces, (n, 6 K)."""
+    force: wp.array2d(dtype=wp.float64)
+    """Of the rows, (n, 6 K)."""
+    response: Response
 
 
 @wp.func
-def slide_of(slots: Slots, velocity: wp.array4d(dtype=wp.float64), step: wp.float64, i: wp.int32, slot: wp.vec2i) -> Slide:
-    """``velocity``: of the rows at the end of the step."""
+def law_at(slots: Slots, step: wp.float64, i: wp.int32, slot: wp.vec2i, velocity: vec6d) -> vec6d:
+    """Forces of a contact's rows without a cone at velocities for the end of the step.
+
+    The normal force is 0 at least. Friction is over the ratio of each coefficient to μ, so that its length counts in the cone.
+    """
     pad, body = slot[0], slot[1]
-    result, lift, frame = Slide(), slots.lift[i, pad, body], slots.frame[i, pad, body]
-    regular, sheared = slots.regularisation[i, pad, body, 0], slots.regularisation[i, pad, body, 1]
-    friction, ratio = wp.max(slots.friction[i, pad, body, 0], LEAST_FRICTION), sheared / regular
-    result.normal = wp.max(slots.force[i, pad, body, 0] + lift - velocity[i, pad, body, 0] / (regular * step), _0)
-    total, along = wp.float64(0.0), wp.vec3d()
-    m = wp.int32(1)
-    while m < _ROWS:
-        part = slots.force[i, pad, body, m] - velocity[i, pad, body, m] / (slots.regularisation[i, pad, body, m] * step)
-        part *= friction / wp.max(slots.friction[i, pad, body, m - 1], LEAST_FRICTION)
-        total += part * part
-        if m < 3:
-            along += part * frame[m]
-        m += 1
-    size = wp.sqrt(total)
-    wanted = friction * ratio * wp.max(size - friction * result.normal, _0)
-    result.lacks = wanted - lift
-    result.cone = _1
-    result.push = frame[0]
-    if wanted > _0 or lift > _0:
-        result.cone = _1 + friction * friction * ratio
-        result.push += friction / wp.max(size, _LEAST_FORCE) * along
+    result, friction = vec6d(), wp.max(slots.friction[i, pad, body, 0], LEAST_FRICTION)
+    for m in range(_ROWS):
+        value = slots.force[i, pad, body, m] - velocity[m] / (slots.regularisation[i, pad, body, m] * step)
+        if m == 0:
+            value = wp.max(value + slots.lift[i, pad, body], _0)
+        else:
+            value *= friction / wp.max(slots.friction[i, pad, body, m - 1], LEAST_FRICTION)
+        result[m] = value
     return result
 
 
 @wp.func
-def shared_compliance(lifts: Lifts, vary: Differences, env: wp.int32, one: wp.vec2i, two: wp.vec2i) -> wp.float64:
-    """1/m [1/kg] by which a force at a contact changes the speed at another.
+def lift_of(slots: Slots, i: wp.int32, slot: wp.vec2i, law: vec6d) -> wp.float64:
+    """Lift [N] that fits to forces of ``law_at``."""
+    pad, body, square = slot[0], slot[1], wp.float64(0.0)
+    for m in range(1, _ROWS):
+        square += law[m] * law[m]
+    friction = wp.max(slots.friction[i, pad, body, 0], LEAST_FRICTION)
+    ratio = slots.regularisation[i, pad, body, 1] / slots.regularisation[i, pad, body, 0]
+    return friction * ratio * wp.max(wp.sqrt(square) - friction * law[0], _0)
 
-    It is negative where it is on one's body and two's pad.
+
+@wp.func
+def settle_contact(slots: Slots, step: wp.float64, lifts: Lifts, i: wp.int32, k: wp.int32) -> wp.float64:
+    """Solve the law of one contact under the present forces of the others.
+
+    Returns the greatest change of a force [N].
     """
-    result = wp.float64(0.0)
-    for m in range(2):
-        for n in range(2):
-            body = wp.where(m == 0, lifts.carrier[one[0]], vary.carrier[one[1]])
-            if body == wp.where(n == 0, lifts.carrier[two[0]], vary.carrier[two[1]]):
-                weight = lifts.share[body] * vary.inverse_weight[env, body]
-                result += wp.where(m == n, weight, -weight)
-    return result
+    slot, change = lifts.slot[i, k], wp.float64(0.0)
+    pad, body = slot[0], slot[1]
+    friction, first = wp.max(slots.friction[i, pad, body, 0], LEAST_FRICTION), _ROWS * k
+    give = wp.float64(0.0)
+    for m in range(1, _ROWS):
+        give = wp.max(give, lifts.response.own[i, first + m] / (slots.regularisation[i, pad, body, m] * step))
+    for _ in range(_INNER):
+        velocity = vec6d()
+        velocity[0] = lifts.free[i, first] + velocity_by(lifts.response, i, first)
+        before = lifts.force[i, first] + _0
+        stiff = _1 / (slots.regularisation[i, pad, body, 0] * step)
+        wanted = slots.force[i, pad, body, 0] + slots.lift[i, pad, body] - stiff * velocity[0]
+        normal = wp.max(before + (wanted - before) / (_1 + stiff * lifts.response.own[i, first]), _0)
+        lifts.force[i, first] = normal
+        add_force(lifts.response, i, first, normal - before)
+        change = wp.max(change, wp.abs(normal - before))
+        for m in range(1, _ROWS):
+            velocity[m] = lifts.free[i, first + m] + velocity_by(lifts.response, i, first + m)
+        law, square = law_at(slots, step, i, slot, velocity), wp.float64(0.0)
+        for m in range(1, _ROWS):
+            scale = friction / wp.max(slots.friction[i, pad, body, m - 1], LEAST_FRICTION)
+            now = scale * lifts.force[i, first + m]
+            law[m] = now + (law[m] - now) / (_1 + give)
+            square += law[m] * law[m]
+        share = wp.min(friction * normal / wp.max(wp.sqrt(square), wp.float64(1e-30)), _1)
+        for m in range(1, _ROWS):
+            scale = friction / wp.max(slots.friction[i, pad, body, m - 1], LEAST_FRICTION)
+            more = share * law[m] / scale - lifts.force[i, first + m]
+            lifts.force[i, first + m] = lifts.force[i, first + m] + more
+            add_force(lifts.response, i, first + m, more)
+            change = wp.max(change, scale * wp.abs(more))
+    return change
 
 
 @wp.func
-def change_of_speed(
-    slots: Slots,
-    lifts: Lifts,
-    vary: Differences,
-    env: wp.int32,
-    i: wp.int32,
-    one: wp.vec2i,
-    two: wp.vec2i,
-    along: wp.vec3d,
-    push: wp.vec3d,
-) -> wp.float64:
-    """a·C b [1/kg]: acceleration at contact one along a by a force b at contact two."""
-    result, body = shared_compliance(lifts, vary, env, one, two) * wp.dot(along, push), vary.carrier[one[1]]
-    if body == vary.carrier[two[1]]:
-        turn = wp.dot(wp.cross(slots.arm[i, one[0], one[1]], along), wp.cross(slots.arm[i, two[0], two[1]], push))
-        result += lifts.share[body] * lifts.turning[body] * vary.inverse_weight[env, body] * turn
-    return result
-
-
-@wp.func
-def eliminate(work: wp.array3d(dtype=wp.float64), i: wp.int32, count: wp.int32, columns: wp.int32) -> wp.bool:
-    """Solve for the ``columns`` after the first ``count`` in place; False if singular.
-
-    The method is that of Gauss and Jordan.
-    """
-    for k in range(count):
-        pivot = wp.int32(k)
-        for j in range(k + 1, count):
-            if wp.abs(work[i, j, k]) > wp.abs(work[i, pivot, k]):
-                pivot = j
-        largest = work[i, pivot, k]
-        if not (wp.abs(largest) > _0 and wp.isfinite(largest)):
-            return False
-        for m in range(k, count + columns):
-            value = work[i, pivot, m] / largest
-            work[i, pivot, m] = work[i, k, m]
-            work[i, k, m] = value
-        for j in range(count):
-            if j != k:
-                factor = work[i, j, k]
-                for m in range(k, count + columns):
-                    work[i, j, m] = work[i, j, m] - factor * work[i, k, m]
-    return True
-
-
-@wp.func
-def begin_jacobian(
-    slots: Slots, velocity: wp.array4d(dtype=wp.float64), step: wp.float64, lifts: Lifts, vary: Differences, env: wp.int32, i: wp.int32,
-    count: wp.int32,
-):  # fmt: skip
-    """−Q P⁻¹, of contacts that do not slide −1; see the module."""
-    for j in range(count):
-        slot = lifts.slot[i, j]
-        regular, normal = slots.regularisation[i, slot[0], slot[1], 0], slots.frame[i, slot[0], slot[1]][0]
-        slide = slide_of(slots, velocity, step, i, slot)
+def settle(slots: Slots, step: wp.float64, lifts: Lifts, i: wp.int32, count: wp.int32):
+    """Solve the law of all contacts, from the velocities ``free`` with the forces of MuJoCo's."""
+    for m in range(lifts.response.state.shape[1]):
+        lifts.response.state[i, m] = _0
+    for row in range(_ROWS * count):
+        add_force(lifts.response, i, row, lifts.force[i, row])
+    for row in range(_ROWS * count):
+        lifts.free[i, row] = lifts.free[i, row] - velocity_by(lifts.response, i, row)
+    sweep = wp.int32(0)
+    while sweep < _SWEEPS:
+        change, largest = wp.float64(0.0), wp.float64(0.0)
         for k in range(count):
-            other = lifts.slot[i, k]
-            push = slide_of(slots, velocity, step, i, other).push
-            own = wp.where(j == k, slide.cone, _0)
-            # Transposed, since P comes on the right.
-            work = own + change_of_speed(slots, lifts, vary, env, i, slot, other, slide.push, push) / regular
-            lifts.work[i, k, j] = work
-            across = change_of_speed(slots, lifts, vary, env, i, slot, other, normal, push) / regular
-            lifts.work[i, k, count + j] = -own - slide.cone * across
-            if j == k:
-                lifts.reach[i, j] = work / slide.cone
-    sound = eliminate(lifts.work, i, count, count)
-    for j in range(count):
-        for k in range(count):
-            lifts.jacobian[i, j, k] = lifts.work[i, k, count + j]
-            if not sound:
-                lifts.jacobian[i, j, k] = wp.where(j == k, -_1 / lifts.reach[i, j], _0)
+            change = wp.max(change, settle_contact(slots, step, lifts, i, k))
+            largest = wp.max(largest, lifts.force[i, _ROWS * k])
+        sweep += 1
+        if change <= _SETTLED * largest:
+            sweep = wp.int32(_SWEEPS)
 
 
 @wp.func
-def solve_lifts(steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, vary: Differences, i: wp.int32):
-    """Set the lifts of an environment, and f₀ of its normal rows, after a solve of MuJoCo's.
+def check_lifts(steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, i: wp.int32) -> wp.bool:
+    """Compare lifts with a solve of MuJoCo's; False if none is to be solved for.
 
-    Clears ``steps.slides`` if all fit. Each step is from the best solve so far; one whose error is not less only corrects the Jacobian.
-    The last lifts are those of the best solve, unless the error fell well.
-
-    Args:
-        velocity: of the rows at the end of the step, by that solve.
+    ``steps.slides`` is cleared if all fit. After the last solve lifts that do not fit are those of the best one, unless the error fell
+    well. ``velocity``: of the rows at the end of the step, by that solve.
     """
-    env, step = steps.envs[i], steps.length[i]
+    step = steps.length[i]
     count, solve, slides, error = wp.int32(0), steps.solves[i] + 1, wp.int32(0), wp.float64(0.0)
     for pad in range(slots.held.shape[1]):
         for body in range(slots.held.shape[2]):
             if slots.held[i, pad, body] != 0 and count < lifts.slot.shape[1]:
-                slot = wp.vec2i(pad, body)
-                slide = slide_of(slots, velocity, step, i, slot)
-                if not wp.abs(slide.lacks) <= _FITS * slide.normal:
+                slot, speeds = wp.vec2i(pad, body), vec6d()
+                for m in range(_ROWS):
+                    speeds[m] = velocity[i, pad, body, m]
+                    lifts.free[i, _ROWS * count + m] = speeds[m]
+                law = law_at(slots, step, i, slot, speeds)
+                lacks = lift_of(slots, i, slot, law) - slots.lift[i, pad, body]
+                if not wp.abs(lacks) <= _FITS * law[0]:
                     slides = wp.int32(1)
-                error += wp.abs(slide.lacks)
+                error += wp.abs(lacks)
                 lifts.slot[i, count] = slot
-                lifts.lift[i, 1, count] = slots.lift[i, pad, body]
-                lifts.lacks[i, 1, count] = slide.lacks
                 count += 1
     steps.slides[i] = slides
     steps.solves[i] = solve
     if slides == 0 or (solve == 1 and not wp.isfinite(error)):
         steps.slides[i] = 0
-        return
-    if solve == 1:
-        begin_jacobian(slots, velocity, step, lifts, vary, env, i, count)
-    elif wp.isfinite(error):
-        for j in range(count):
-            length, change = wp.float64(0.0), lifts.lacks[i, 1, j] - lifts.lacks[i, 0, j]
-            for k in range(count):
-                if j == k or shared_compliance(lifts, vary, env, lifts.slot[i, j], lifts.slot[i, k]) != _0:
-                    moved = lifts.lift[i, 1, k] - lifts.lift[i, 0, k]
-                    length += moved * moved
-                    change -= lifts.jacobian[i, j, k] * moved
-            for k in range(count):
-                if length > _0 and (j == k or shared_compliance(lifts, vary, env, lifts.slot[i, j], lifts.slot[i, k]) != _0):
-                    moved = lifts.lift[i, 1, k] - lifts.lift[i, 0, k]
-                    lifts.jacobian[i, j, k] = lifts.jacobian[i, j, k] + change / length * moved
-    falls = solve == 1 or error < _FALLS * lifts.least[i]
-    if solve == 1 or error < lifts.least[i]:
+        return False
+    falls, better = solve == 1, solve == 1
+    if solve > 1:
+        falls, better = error < _FALLS * lifts.least[i], error < lifts.least[i]
+    if better:
         lifts.least[i] = error
-        for j in range(count):
-            lifts.lift[i, 0, j] = lifts.lift[i, 1, j]
-            lifts.lacks[i, 0, j] = lifts.lacks[i, 1, j]
-    goes_on = falls or solve < lifts.solves
-    for j in range(count):
-        lifts.work[i, j, count] = -lifts.lacks[i, 0, j]
         for k in range(count):
-            lifts.work[i, j, k] = lifts.jacobian[i, j, k]
-    sound = eliminate(lifts.work, i, count, 1)
-    # A step that is too long is shortened as a whole: where one body slides on several pads, lifts fit only along a narrow valley.
-    whole = wp.float64(_1)
-    for j in range(count):
-        if not (sound and wp.isfinite(lifts.work[i, j, count])):
-            sound = wp.bool(False)
-    for j in range(count):
-        if not sound:
-            lifts.work[i, j, count] = lifts.reach[i, j] * lifts.lacks[i, 0, j]
-        farthest = _FARTHEST * lifts.reach[i, j] * lifts.least[i]
-        whole = wp.min(whole, farthest / wp.max(wp.abs(lifts.work[i, j, count]), wp.float64(1e-30)))
-    for j in range(count):
-        slot = lifts.slot[i, j]
-        lift = lifts.lift[i, 0, j] + wp.where(goes_on, whole, _0) * lifts.work[i, j, count]
-        lift = wp.max(lift, _0)
-        more = lift - lifts.lift[i, 1, j]
-        slots.lift[i, slot[0], slot[1]] = lift
-        slots.force[i, slot[0], slot[1], 0] = slots.force[i, slot[0], slot[1], 0] - more
+            lifts.best[i, k] = slots.lift[i, lifts.slot[i, k][0], lifts.slot[i, k][1]]
+        if falls or solve < lifts.solves:
+            return True
+    # Halfway back to the best lifts: the solution ahead of them was on the other side of a change that its response does not know.
+    share = wp.where(solve < lifts.solves and wp.isfinite(error), _HALF, _0)
+    for k in range(count):
+        slot = lifts.slot[i, k]
+        set_lift(slots, i, slot, lifts.best[i, k] + share * (slots.lift[i, slot[0], slot[1]] - lifts.best[i, k]))
+    return False
+
+
+@wp.func
+def set_lift(slots: Slots, i: wp.int32, slot: wp.vec2i, lift: wp.float64):
+    """Set a contact's lift, which f₀ of its normal row is less by."""
+    more = lift - slots.lift[i, slot[0], slot[1]]
+    slots.lift[i, slot[0], slot[1]] = lift
+    slots.force[i, slot[0], slot[1], 0] = slots.force[i, slot[0], slot[1], 0] - more
+
+
+@wp.func
+def solve_lifts(steps: Steps, slots: Slots, lifts: Lifts, i: wp.int32, count: wp.int32):
+    """Set the lifts of the first ``count`` contacts, and f₀ of their normal rows, by the law.
+
+    ``lifts`` has the forces of a solve of MuJoCo's, after ``check_lifts``, and of ``response`` its mass and rows.
+    """
+    step = steps.length[i]
+    if not factorise(lifts.response, i, _ROWS * count, step):
+        return
+    settle(slots, step, lifts, i, count)
+    for k in range(count):
+        speeds = vec6d()
+        for m in range(_ROWS):
+            row = _ROWS * k + m
+            speeds[m] = lifts.free[i, row] + velocity_by(lifts.response, i, row)
+        # Forces of all contacts are known now, so that one lift more does not change the velocities of the others.
+        slot = lifts.slot[i, k]
+        lift = lift_of(slots, i, slot, law_at(slots, step, i, slot, speeds))
+        if wp.isfinite(lift):
+            set_lift(slots, i, slot, lift)

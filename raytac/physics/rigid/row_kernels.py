@@ -186,16 +186,16 @@ def set_rows(
     # What MuJoCo's convex cone adds to the normal force of a contact that slips, at the speed at the start of the step. Beyond the cone,
     # the force without it, (F, T), is projected to F + μ r (T − μF) / (1 + μ² r) with r the ratio of the dampings. If the free
     # acceleration, and its friction, make a different speed at the end, a slide begins or ends.
-    lift = wp.float64(0.0)
+    lift, elastic = wp.float64(0.0), wp.vec3d(pull[0], pull[1], pull[2] / lever)
+    slip = wp.vec3d(slip[0], slip[1], slip[2] * lever)
+    trial = wp.length(elastic + damping * slip)
     if spring.force > _0:
         back, frame = wp.transpose(rotation), frame_of(frames, touched, body)
         swing = back * (frames.swing[i, frame] - frames.swing[i, pad])
         gain = back * (push_at(frames, i, frame, at) - push_at(frames, i, pad, at))
         per_lift = friction * spring.damping / damping
-        elastic = wp.vec3d(pull[0], pull[1], pull[2] / lever)
-        slip = wp.vec3d(slip[0], slip[1], slip[2] * lever)
         gained = wp.vec3d(wp.dot(gain, first), wp.dot(gain, second), wp.dot(swing, normal) * lever)
-        lift = per_lift * wp.max(wp.length(elastic + damping * slip) - limit, _0)
+        lift = per_lift * wp.max(trial - limit, _0)
         free = wp.length(elastic + damping * (slip + step * gained)) - limit * (_1 + damping * step * compliance)
         if wp.abs(per_lift * wp.max(free, _0) - lift) > _CHANGE * spring.force:
             steps.slides[i] = 1
@@ -211,13 +211,16 @@ def set_rows(
     slots.friction[i, pad, body, 0] = friction
     slots.friction[i, pad, body, 1] = friction
     slots.friction[i, pad, body, 2] = friction * lever
+    # The cone of a contact that slips cuts tilt and rolling by the share by which it cuts friction, though the pressure, not friction, is
+    # what turns a face back. So these rows are those of the load under which the contact would stick.
+    held_load = wp.max(load, trial / wp.max(friction, _LEAST))
     # The friction of rolling at the end of the step, by the spin at its start; what damps it does not act on that spin.
     held, spins = rolling[env, pad, body], wp.vec2d(wp.dot(spin, axes[1]), wp.dot(spin, axes[2]))
     spreads, plastic = wp.vec2d(wp.max(mean - half, _0), mean + half), _ROLLING * gels.hysteresis[pad]
     arms = wp.vec2d(wp.min(spreads[0], wp.abs(height)), wp.min(spreads[1], wp.abs(height)))
     bend = _GIVE / wp.max(radius, _LEAST) * arms
     share = rolled_on(wp.vec2d(cos * held[0] + sin * held[1], cos * held[1] - sin * held[0]), step * wp.cw_mul(bend, spins))
-    torque = plastic * radius * load * share
+    torque = plastic * radius * held_load * share
     slots.bend[i, pad, body] = bend
     per_square = damping / wp.pow(wp.max(friction, _LEAST), _2)
     k = wp.int32(0)
@@ -225,15 +228,14 @@ def set_rows(
         metacentric = wp.max(spreads[k] - height, _0)
         # The cone must not cut this row before the centre of pressure is near the edge.
         edge = _EDGE * radius * metacentric / (metacentric + wp.abs(height) + wp.float64(1e-9))
-        tilt = wp.max(friction * wp.sqrt(load * step / damping * metacentric), edge)
-        whole = friction * wp.sqrt(load * step / damping * (metacentric + _GIVE * plastic * arms[k]))
+        tilt = wp.max(friction * wp.sqrt(held_load * step / damping * metacentric), edge)
+        whole = friction * wp.sqrt(held_load * step / damping * (metacentric + _GIVE * plastic * arms[k]))
         whole = wp.max(wp.max(tilt, whole), _ROOM * plastic * radius)
         slots.friction[i, pad, body, 3 + k] = whole
         slots.force[i, pad, body, 4 + k] = per_square * (whole * whole - tilt * tilt) * spins[k] - torque[k] * arms[k] / wp.max(
             spreads[k], _LEAST
         )
         k += 1
-    slots.arm[i, pad, body] = rotation * arm
     slots.lift[i, pad, body] = lift
     slots.force[i, pad, body, 0] = spring.force - lift
     slots.force[i, pad, body, 1] = -(cos * pull[0] + sin * pull[1])

@@ -130,8 +130,6 @@ class Slots:
     """R, (…, ROWS)."""
     bend: wp.array3d(dtype=wp.vec2d)
     """Share of the torque of rolling that builds up per angle about each tangent [1/rad]."""
-    arm: wp.array3d(dtype=wp.vec3d)
-    """From the body's centre of mass to the contact, world frame."""
     lift: wp.array3d(dtype=wp.float64)
     """Normal force that MuJoCo's cone adds, which f₀ is without [N]."""
     wrench: wp.array3d(dtype=wp.spatial_vectord)

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.physics.rigid.lift_kernels import LEAST_FRICTION, Lifts, solve_lifts
+from raytac.physics.rigid.lift_kernels import LEAST_FRICTION
 from raytac.physics.rigid.motion_kernels import Frames
-from raytac.physics.rigid.world_kernels import ROWS, Differences, Slots, Steps
+from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
 from raytac.world.engine.gap_kernels import closing, is_among, is_box, is_open, passes
 from raytac.world.world_state import LARGEST_SPEED
 
@@ -58,6 +58,7 @@ class Memory:
     qacc_smooth: wp.int32
     qacc: wp.int32
     qacc_warmstart: wp.int32
+    M: wp.int32
     efc_J_rownnz: wp.int32
     efc_J_rowadr: wp.int32
     efc_J_colind: wp.int32
@@ -67,6 +68,8 @@ class Memory:
     efc_vel: wp.int32
     efc_aref: wp.int32
     efc_force: wp.int32
+    efc_state: wp.int32
+    efc_id: wp.int32
     geom_xpos: wp.int32
     geom_xmat: wp.int32
     # Of a contact: its size and its members, [8 byte] and [4 byte].
@@ -314,41 +317,6 @@ def write_references(memory: Memory, steps: Steps, slots: Slots, hard: wp.array(
                 contact[n + memory.mu] *= _SLIPPERY
                 for m in range(_ROWS - 1):
                     contact[n + memory.friction + m] *= _SLIPPERY
-    write_gel_references(memory, steps, slots, i)
-
-
-@wp.kernel
-def correct_lifts(
-    memory: Memory, steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, vary: Differences
-):
-    """Set the lifts of slides that begin or end; see ``solve_lifts``.
-
-    They follow from MuJoCo's speeds for the end of the step.
-    """
-    i = wp.tid()
-    if steps.slides[i] == 0 or steps.lost[i] != 0:
-        return
-    env, step = steps.envs[i], steps.length[i]
-    before = doubles(memory, env, memory.efc_vel)
-    acceleration = doubles(memory, env, memory.qacc)
-    first = number(memory, env, memory.nefc) - _ROWS * steps.contacts[i]
-    row, sound = wp.int32(first), wp.bool(True)
-    for pad in range(slots.held.shape[1]):
-        for body in range(slots.held.shape[2]):
-            if slots.held[i, pad, body] != 0:
-                m = wp.int32(0)
-                while m < _ROWS:
-                    ahead = before[row] + step * row_times(memory, env, row, acceleration)
-                    velocity[i, pad, body, m] = ahead
-                    sound = sound and wp.isfinite(ahead)
-                    row += 1
-                    m += 1
-    if sound:
-        # The next solve, which differs by lifts, begins with this solution.
-        guess = doubles(memory, env, memory.qacc_warmstart)
-        for k in range(memory.nv):
-            guess[k] = acceleration[k]
-    solve_lifts(steps, slots, velocity, lifts, vary, i)
     write_gel_references(memory, steps, slots, i)
 
 

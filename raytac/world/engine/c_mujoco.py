@@ -23,13 +23,13 @@ from raytac.robots.states import StateReader, body_pose, site_pose
 from raytac.warp_runtime import Recorded
 from raytac.world.engine.c_kernels import (
     Memory,
-    correct_lifts,
     read_constraint,
     read_frames,
     write_contacts,
     write_references,
     write_regularisation,
 )
+from raytac.world.engine.c_lift_kernels import correct_lifts
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.hard_contacts import box_sizes
 from raytac.world.implicit_damping import ImplicitDamping
@@ -91,8 +91,9 @@ class CMujoco:
         roots, last = model.body_rootid[bodies], last_dofs(model, bodies)
         indices = [_array(values) for values in (pads.sites, bodies, roots, last, model.dof_parentid)]
         gels, others = _array(pads.geoms[len(pads.bodies) :]), _array(pads.geoms)
+        mass = [_array(values) for values in (model.M_rownnz, model.M_rowadr, model.M_colind)]
         launch = partial(wp.launch, device="cpu")
-        contact.expect_lifts(_SOLVES, self._damping.body_share, model.body_invweight0)
+        contact.expect_lifts(_SOLVES, model.nv)
         frames = [memory, steps, *indices, wp.array(self._damping.share, dtype=wp.float64, device="cpu"), contact.frames]
         forces = [memory, slots, steps, contact.force, contact.velocity]
         self.read_frames = partial(launch, read_frames, dim=(num_envs, len(bodies)), inputs=frames)
@@ -103,7 +104,7 @@ class CMujoco:
                 (write_contacts, [gels, others]),
                 (write_regularisation, []),
                 (write_references, [_array(pads.hard), wp.array(box_sizes(model), dtype=wp.vec3d, device="cpu")]),
-                (correct_lifts, [contact.velocity, *contact.lifts]),
+                (correct_lifts, [*mass, contact.velocity, contact.lifts]),
             )
         )
         self.bind(datas)
@@ -273,7 +274,8 @@ def _blank() -> mujoco.MjContact:
 
 _POINTERS = (
     "contact", "qpos", "qvel", "xpos", "xmat", "site_xpos", "site_xmat", "subtree_com", "cvel", "cdof", "qacc_smooth", "qacc",
-    "qacc_warmstart", "efc_J_rownnz", "efc_J_rowadr", "efc_J_colind", "efc_J", "efc_D", "efc_R", "efc_vel", "efc_aref", "efc_force",
+    "qacc_warmstart", "M", "efc_J_rownnz", "efc_J_rowadr", "efc_J_colind", "efc_J", "efc_D", "efc_R", "efc_vel", "efc_aref", "efc_force",
+    "efc_state", "efc_id",
     "geom_xpos", "geom_xmat",
 )  # fmt: skip
 _DOUBLES = ("dist", "pos", "frame", "friction", "mu")

@@ -22,6 +22,7 @@ from raytac.physics.rigid.world_kernels import ROWS
 from raytac.robots.states import Numbers, body_pose, site_pose
 from raytac.warp_runtime import start_warp
 from raytac.world.engine import mjwarp_kernels as kernels
+from raytac.world.engine.mjwarp_lift_kernels import correct_lifts
 from raytac.world.engine.number_reader import NumberReader
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.hard_contacts import box_sizes
@@ -98,7 +99,7 @@ class MujocoWarp:
         self._rows = 4 * self._contacts if rows is None else rows
         damping = ImplicitDamping(model)
         self._damped, self._always = damping.matters, int(pads.hard.any())
-        self._contact.expect_lifts(_SLIDES, damping.body_share, model.body_invweight0)
+        self._contact.expect_lifts(_SLIDES, model.nv)
         with wp.ScopedDevice(self.device):
             sizes = {name: num_envs for name in _VARIED if getattr(model, name).size}
             try:
@@ -110,6 +111,7 @@ class MujocoWarp:
             self.data: Any = mjw.make_data(model, nworld=num_envs, nconmax=self._contacts, njmax=self._rows)
             self._use_gel_contacts()
             self._worlds = _worlds(self.model, self.data)
+            self._entries = [self.model.M_rownnz, self.model.M_rowadr, self.model.M_colind]
             shape = num_envs, *slots
             self._own: Any = kernels.Own()
             self.active, self._done = wp.full(num_envs, value=True, dtype=wp.bool), wp.zeros(num_envs, dtype=wp.int32)
@@ -219,8 +221,8 @@ class MujocoWarp:
             self._launch(kernels.write_rows, own.contact.shape, [worlds, steps, slots, own])
             for _ in range(_SLIDES):
                 mjw.solve(self.model, self.data)
-                lifts = [self._contact.velocity, *self._contact.lifts]
-                self._launch(kernels.correct_lifts, self.num_envs, [worlds, own, steps, slots, *lifts])
+                lifts = [self._contact.velocity, self._contact.lifts]
+                self._launch(correct_lifts, self.num_envs, [worlds, own, steps, slots, *self._entries, *lifts])
 
     def _add_damping(self) -> None:
         model, data, steps = self.model, self.data, self._contact.steps
@@ -371,8 +373,9 @@ def _worlds(model: Any, data: Any) -> Any:
         setattr(result, name, getattr(data.contact, name))
     for name in ("rownnz", "rowadr", "colind"):
         setattr(result, name, getattr(data.efc, f"J_{name}"))
-    for name in ("J", "D", "vel", "aref", "force"):
+    for name in ("J", "D", "vel", "aref", "force", "state", "id"):
         setattr(result, name, getattr(data.efc, name))
+    result.row_type = data.efc.type
     return result
 
 

@@ -15,9 +15,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.physics.rigid.lift_kernels import LEAST_FRICTION, Lifts, solve_lifts
+from raytac.physics.rigid.lift_kernels import LEAST_FRICTION
 from raytac.physics.rigid.motion_kernels import Frames
-from raytac.physics.rigid.world_kernels import ROWS, Differences, Slots, Steps
+from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
 from raytac.world.engine.gap_kernels import closing, is_among, is_box, is_open, passes
 from raytac.world.world_state import LARGEST_SPEED
 
@@ -94,6 +94,9 @@ class Worlds:
     rowadr: wp.array2d(dtype=wp.int32)
     colind: wp.array3d(dtype=wp.int32)
     J: wp.array3d(dtype=wp.float32)
+    state: wp.array2d(dtype=wp.int32)
+    id: wp.array2d(dtype=wp.int32)
+    row_type: wp.array2d(dtype=wp.int32)
     D: wp.array2d(dtype=wp.float32)
     vel: wp.array2d(dtype=wp.float32)
     aref: wp.array2d(dtype=wp.float32)
@@ -392,45 +395,6 @@ def write_hard_references(
     if open:
         # MuJoCo's cone acts across a gap that is smaller than the friction times the slide of the step.
         worlds.friction[k] = _SLIPPERY * worlds.friction[k]
-
-
-@wp.kernel
-def correct_lifts(
-    worlds: Worlds, own: Own, steps: Steps, slots: Slots, velocity: wp.array4d(dtype=wp.float64), lifts: Lifts, vary: Differences,
-):  # fmt: skip
-    """Set the lifts of slides that begin or end; see ``solve_lifts``.
-
-    They follow from MuJoCo's speeds for the end of the step.
-    """
-    i = wp.tid()
-    sound = wp.bool(True)
-    for k in range(worlds.nv):
-        sound = sound and wp.isfinite(worlds.qacc[i, k])
-    if sound:
-        # The next solve, which may differ by lifts, begins with this solution.
-        for k in range(worlds.nv):
-            worlds.qacc_warmstart[i, k] = worlds.qacc[i, k]
-    if steps.slides[i] == 0 or steps.lost[i] != 0:
-        return
-    step = steps.length[i]
-    for pad in range(slots.held.shape[1]):
-        for body in range(slots.held.shape[2]):
-            k = own.contact[i, pad, body]
-            if k >= 0:
-                for m in range(_ROWS):
-                    row = worlds.efc_address[k, m] + 0
-                    if row < 0:
-                        return
-                    ahead = wp.float64(worlds.vel[i, row]) + step * row_times(worlds, i, row, worlds.qacc)
-                    velocity[i, pad, body, m] = ahead / wp.where(is_scaled(m), own.scale[i, pad, body], _1)
-    solve_lifts(steps, slots, velocity, lifts, vary, i)
-    for pad in range(slots.held.shape[1]):
-        for body in range(slots.held.shape[2]):
-            k = own.contact[i, pad, body]
-            if k >= 0:
-                row = worlds.efc_address[k, 0]
-                wanted = slots.force[i, pad, body, 0] * slots.regularisation[i, pad, body, 0]
-                worlds.aref[i, row] = wp.float32(wanted - wp.float64(worlds.vel[i, row]) / step)
 
 
 @wp.kernel

@@ -113,7 +113,9 @@ def gel_rows(
     damping = step * stiffness[:, 0] * np.where(sticks > 0.0, np.maximum(sticks, 0.5), np.maximum(ratio / slip_lever**2, 1.0))
     spread, height, turn = _tilt(contacts, motion, row, mass_centre)
     metacentric = np.maximum(spread - height[:, None], 0.0)
-    per_square = (load * step / damping)[:, None]
+    # Of the load under which the contact would stick: MuJoCo's cone cuts tilt and rolling as it cuts friction.
+    held_load = np.maximum(load, _trial(moving, lever, damping, pull) / np.maximum(friction, 1e-6))
+    per_square = (held_load * step / damping)[:, None]
     tilt = friction[:, None] * np.sqrt(per_square * metacentric)
     # The cone must not cut this row before the centre of pressure is near the edge.
     tilt = np.maximum(tilt, _EDGE * radius[:, None] * metacentric / (metacentric + np.abs(height)[:, None] + 1e-9))
@@ -130,7 +132,7 @@ def gel_rows(
     spin = (axes[:, 1:] @ motion.spin[at_rows(contacts, row)][..., None])[..., 0]
     bend = 8.0 * arm / np.maximum(radius, 1e-6)[:, None]
     share = rolled_on((rolling[:, None] @ turn)[:, 0], step[:, None] * bend * spin)
-    force[:, 4:] = (damping / friction**2)[:, None] * (whole**2 - tilt**2) * spin - plastic * (radius * load)[
+    force[:, 4:] = (damping / friction**2)[:, None] * (whole**2 - tilt**2) * spin - plastic * (radius * held_load)[
         :, None
     ] * share * arm / np.maximum(spread, 1e-6)
     rotation, origin = motion.world_from_pad[row, contacts.pad, :3, :3], motion.world_from_pad[row, contacts.pad, :3, 3]
@@ -198,6 +200,13 @@ def slip_levers(radius: np.ndarray) -> np.ndarray:
     return 3.0 * np.pi / 16.0 * np.maximum(radius, 1e-6)
 
 
+def _trial(moving: _Moving, lever: np.ndarray, damping: np.ndarray, pull: np.ndarray) -> np.ndarray:
+    """Friction (n,) of contacts without a bound, the torque about the normal over ``lever`` among it."""
+    tangential = pull[:, :2] + damping[:, None] * moving.slip()
+    torque = pull[:, 2] / lever + damping * moving.turning() * lever
+    return np.sqrt(np.vecdot(tangential, tangential) + torque**2)
+
+
 def _lift(
     moving: _Moving,
     spring: NormalSpring,
@@ -216,9 +225,7 @@ def _lift(
     """
 
     def excess(moving: _Moving, share: np.ndarray) -> np.ndarray:
-        tangential = pull[:, :2] + damping[:, None] * moving.slip()
-        torque = pull[:, 2] / lever + damping * moving.turning() * lever
-        over = np.sqrt(np.vecdot(tangential, tangential) + torque**2) - share * friction * moving.load
+        over = _trial(moving, lever, damping, pull) - share * friction * moving.load
         return np.where(spring.force > 0.0, friction * spring.damping / damping * np.maximum(over, 0.0), 0.0)
 
     lift = excess(moving, np.ones_like(step))
