@@ -28,7 +28,7 @@ from raytac.device import resolve_device
 from raytac.errors import BackendError, InputError
 from raytac.gel import GelSurface, PadGrid
 from raytac.io import CommonOptions, Progress
-from raytac.optics import RayTraced, Unet, UnetMode, UnetNetwork, UnetWeights, save_unet
+from raytac.optics import RayTraced, Unet, UnetMode, UnetNetwork, UnetWeights, look_digest, save_unet
 from raytac.specs import SweepSpec, load_press, load_sweep
 
 HELD_OUT = 10
@@ -191,7 +191,8 @@ def main(args: Args) -> None:
         rest = tracer.render(GelSurface.at_rest(grid)).rgb
         assert rest is not None
         network = UnetNetwork(widths).to(device)
-        provenance = {"source": "ray-traced presses", "sensor": sensor.name, "sweep": args.sweep, "presses": str(len(presses))}
+        provenance = {"source": "ray-traced presses", "sensor": sensor.name, "look": look_digest(sensor)}
+        provenance |= {"sweep": args.sweep, "presses": str(len(presses)), "steps": str(args.steps)}
         view = tuple(n * p for n, p in zip(sensor.camera.resolution, sensor.camera.pixel_pitch, strict=True))
         weights = UnetWeights(widths, network.layers(), rest[0], provenance, view)
         reach = round(RING / sensor.camera.pitch_at(size)[0])

@@ -12,6 +12,7 @@ from .image.config import Phong as Phong
 from .image.config import PhongLight as PhongLight
 from .image.config import Unet as Unet
 from .image.mlp import MlpMode as MlpMode
+from .image.network_files import look_digest as look_digest
 from .image.phong import PhongMode as PhongMode
 from .image.unet import UnetMode as UnetMode
 from .image.unet_network import UnetNetwork as UnetNetwork

@@ -11,9 +11,10 @@ import pytest
 
 from raytac.errors import BackendError, CalibrationError, InputError
 from raytac.gel.surface import GelSurface
-from raytac.optics import Unet, UnetWeights, load_unet, save_unet
+from raytac.optics import Unet, UnetWeights, load_unet, look_digest, save_unet
 from raytac.optics.image.network_files import view_size
 from raytac.optics.image.unet_weights import INPUTS, layer_shapes
+from raytac.specs import load_sensor
 from tests.conftest import make_sensor_spec
 from tests.optics.scenes import ball, grid_of, surface
 
@@ -49,8 +50,6 @@ def test_files_come_back_or_are_refused(tmp_path: Path) -> None:
         np.testing.assert_allclose(again.layers[name], array, rtol=1e-3)
     with pytest.raises(CalibrationError, match="holds one"):
         load_unet(tmp_path / "none.npz")
-    with pytest.raises(InputError, match="must name a network"):
-        Unet()
     for name, broken, match in (
         ("shape", dataclasses.replace(weights, layers=weights.layers | {"last.bias": np.zeros(4)}), r"last\.bias"),
         ("number", dataclasses.replace(weights, layers=weights.layers | {"last.bias": np.full(3, np.nan)}), r"last\.bias"),
@@ -164,6 +163,13 @@ class TestWithTorch:
         rgb = mode.render(dataclasses.replace(rest, ink=ink)).rgb
         assert rgb is not None
         assert rgb[0, 30, 40].max() < 80 and (rgb[0, 5, 5] == 120).all()
+
+    def test_the_shipped_network_is_of_the_default_minis_look_alone(self) -> None:
+        mini = load_sensor("gelsight_mini")
+        mode = Unet().build(mini, device="cpu")
+        assert mode.weights.provenance["look"] == look_digest(mini) == look_digest(load_sensor("gelsight_mini_9x11"))
+        with pytest.raises(InputError, match="must name a network for the sensor 'gelsight_mini_calibrated'"):
+            Unet().build(load_sensor("gelsight_mini_calibrated"), device="cpu")
 
     def test_a_network_of_another_view_is_refused(self) -> None:
         spec = make_sensor_spec()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,12 @@ def view_size(sensor: SensorSpec) -> tuple[float, float]:
     """Width and height of the pad in a sensor's view [m]."""
     width, height = (n * p for n, p in zip(sensor.camera.resolution, sensor.camera.pixel_pitch, strict=True))
     return width, height
+
+
+def look_digest(sensor: SensorSpec) -> str:
+    """Digest of what a sensor's image depends on beside its coat's shape: lights, coat, case, camera and response."""
+    look = (sensor.lights, sensor.coat, sensor.case, sensor.camera, sensor.response, sensor.optics)
+    return hashlib.sha256(repr(look).encode()).hexdigest()[:16]
 
 
 def check_view(name: str, sensor: SensorSpec, view: tuple[float, float] | None, provenance: dict[str, str]) -> None:

@@ -7,13 +7,14 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from raytac.errors import BackendError
+from raytac.assets import asset_root
+from raytac.errors import BackendError, InputError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.camera import Pinhole
 from raytac.optics.device_mode import DeviceFrame, DeviceMode, Float, FrameInputs, UInt8
 from raytac.optics.image.base import see_heights
 from raytac.optics.image.config import Unet
-from raytac.optics.image.network_files import check_view
+from raytac.optics.image.network_files import check_view, look_digest
 from raytac.optics.image.unet_weights import UnetWeights, load_unet
 from raytac.optics.ink import darkened
 
@@ -39,9 +40,7 @@ class UnetMode(DeviceMode):
             from raytac.optics.image.unet_network import network_of
         except ImportError as error:
             raise BackendError(f"optics='unet' needs PyTorch ({error}): `pip install torch`") from error
-        weights = self.config.weights
-        assert weights is not None
-        self.weights = weights if isinstance(weights, UnetWeights) else load_unet(weights)
+        self.weights = self._own_weights()
         check_view("unet", self.sensor, self.weights.view, self.weights.provenance)
         height, width = self.weights.background.shape[:2]
         self._seeing = Pinhole.from_spec(self.sensor.camera, (width, height), self.slab)
@@ -50,6 +49,18 @@ class UnetMode(DeviceMode):
             background = torch.from_numpy(self.weights.background.astype(np.float32))[None].permute(0, 3, 1, 2).to(self.device)
             rest = self._network(torch.zeros((1, 4, height, width), device=self.device))
             self._rest_levels = self._resized(background - rest)
+
+    def _own_weights(self) -> UnetWeights:
+        """The network that was asked for, or the shipped one if it is of this sensor's look."""
+        weights = self.config.weights
+        if weights is not None:
+            return weights if isinstance(weights, UnetWeights) else load_unet(weights)
+        shipped = load_unet(asset_root("scenes") / "networks" / "gelsight_mini_unet.npz")
+        if shipped.provenance.get("look") != look_digest(self.sensor):
+            rule = f"must name a network for the sensor {self.sensor.name!r}: the one that comes with raytac is of other lights or another "
+            rule += "camera (`python experiments/train_unet.py` fits one)"
+            raise InputError("weights", rule=rule)
+        return shipped
 
     def _build(self, grid: PadGrid) -> list[Float]:
         return []
