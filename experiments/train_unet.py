@@ -12,6 +12,9 @@ tenth press is held out, and the presses of ``--unseen`` are of an object that t
 ``unet.ms`` and ``raytrace.ms``, medians of an image from the host's heights to the host, one at a time; ``unet.kilobytes``.
 """
 
+# pyright: reportMissingImports=false
+# (The tests do without PyTorch.)
+
 from __future__ import annotations
 
 import dataclasses
@@ -28,7 +31,7 @@ from raytac.device import resolve_device
 from raytac.errors import BackendError, InputError
 from raytac.gel import GelSurface, PadGrid
 from raytac.io import CommonOptions, Progress
-from raytac.optics import RayTraced, Unet, UnetMode, UnetNetwork, UnetWeights, look_digest, save_unet
+from raytac.optics import RayTraced, Unet, UnetMode, UnetWeights, look_digest, new_unet, save_unet, view_size
 from raytac.specs import SweepSpec, load_press, load_sweep
 
 HELD_OUT = 10
@@ -107,7 +110,7 @@ def seen(mode: UnetMode, presses: Presses, grid: PadGrid) -> Any:
     return torch.cat([mode.maps(presses.rows(slice(k, k + 64)).surface(grid)).half() for k in range(0, len(presses), 64)])
 
 
-def trained(network: UnetNetwork, maps: Any, presses: Presses, rest: np.ndarray, args: Args, reach: int) -> None:
+def trained(network: Any, maps: Any, presses: Presses, rest: np.ndarray, args: Args, reach: int) -> None:
     """Fit ``network`` to the presses, whose image at rest is ``rest`` (H, W, 3)."""
     import torch
 
@@ -190,10 +193,10 @@ def main(args: Args) -> None:
         tracer = RayTraced().build(sensor, resolution=size, device=device)
         rest = tracer.render(GelSurface.at_rest(grid)).rgb
         assert rest is not None
-        network = UnetNetwork(widths).to(device)
+        network = new_unet(widths, device)
         provenance = {"source": "ray-traced presses", "sensor": sensor.name, "look": look_digest(sensor)}
         provenance |= {"sweep": args.sweep, "presses": str(len(presses)), "steps": str(args.steps)}
-        view = tuple(n * p for n, p in zip(sensor.camera.resolution, sensor.camera.pixel_pitch, strict=True))
+        view = view_size(sensor)
         weights = UnetWeights(widths, network.layers(), rest[0], provenance, view)
         reach = round(RING / sensor.camera.pitch_at(size)[0])
         held_out = np.arange(len(presses)) % HELD_OUT == HELD_OUT - 1

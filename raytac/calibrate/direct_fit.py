@@ -19,7 +19,6 @@ import numpy as np
 
 from raytac.calibrate.direct_light import ExtraLight, LedLight, Light, case_light, led_light
 from raytac.calibrate.imprint import PixelGeometry, pixel_geometry
-from raytac.calibrate.light_bounds import leds_inside
 from raytac.calibrate.light_parameters import (
     DARKEST,
     HEIGHT,
@@ -27,6 +26,7 @@ from raytac.calibrate.light_parameters import (
     REFERENCE_DISTANCE,
     LightParameters,
     darkest,
+    leds_inside,
     mean_power,
     side_ties,
 )

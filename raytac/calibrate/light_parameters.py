@@ -1,4 +1,4 @@
-"""Parameters of a fit of lights: LEDs, glow of the case, response; and ties between LEDs.
+"""Parameters of a fit of lights: LEDs and their bounds, glow, response, ties.
 
 An LED has place, aim, lobe, height, length and power. A press says something only about the light that reaches it, so LEDs far from all
 presses are poorly known. Ties carry over from those nearby: LEDs of one side are of one kind, and stand mirrored about the middle of
@@ -17,6 +17,7 @@ from raytac.calibrate.photographs import decode
 from raytac.errors import InputError
 from raytac.optics.trace.quadrature import EdgePoints, quadrature
 from raytac.specs import LedSpec, LightsSpec, SensorSpec
+from raytac.specs.sensor_check import view_edges
 
 CHANNELS = ("red", "green", "blue")
 DARKEST = 0.85
@@ -33,6 +34,8 @@ LENGTH = 7
 """Column that has the emitting face's length, along ``LedSpec.edges[0]``."""
 SHORTEST = 0.1
 """Least of a fitted length [mm]; the most is what the case takes."""
+GAP = 0.02
+"""Distance [mm] that an LED's corners keep from the case and the gel."""
 REFERENCE_DISTANCE = 10e-3
 """Distance [m] at which a power of 1 gives a coat facing the LED full scale."""
 
@@ -214,3 +217,50 @@ def side_ties(p: LightParameters, size: int) -> Ties:
             for power in range(p.leds.size, p.leds.size + 3):
                 tie(POWER * mean_power(p), 0.0, (power + 3 * a, 1), (power + 3 * b, -1))
     return Ties(np.array(rows).reshape(len(rows), size), np.array(offsets))
+
+
+def leds_inside(sensor: SensorSpec, p: LightParameters, *, lengths: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """Rows of ``p.leds`` moved to what a sensor accepts, (L, 8).
+
+    LEDs lie in the case and below gel and plate; virtual sources up to the coat, on that side of the view where they begin. Lengths and
+    heights change where ``lengths`` and ``heights`` (L,) are true, and aims and lobes as far as they may.
+    """
+    leds = p.leds.copy()
+    leds[:, 4], leds[:, 5] = np.clip(leds[:, 4], -1.4, 1.4), np.clip(leds[:, 5], 1.0, 15.0)
+    leds[:, HEIGHT] = np.where(heights, np.clip(leds[:, HEIGHT], *HEIGHTS), leds[:, HEIGHT])
+    u, v = _edges(leds)
+    room = 1e3 * np.array(sensor.case.size) - 2 * GAP - leds[:, HEIGHT, None] * np.abs(v[:, :2])
+    longest = np.maximum((room / np.maximum(np.abs(u[:, :2]), 1e-6)).min(1), SHORTEST)
+    leds[:, LENGTH] = np.where(lengths, np.clip(leds[:, LENGTH], SHORTEST, longest), leds[:, LENGTH])
+    reach = GAP + 0.5 * (leds[:, LENGTH, None] * np.abs(u) + leds[:, HEIGHT, None] * np.abs(v))
+    low, high = _beside_view(sensor, p)
+    leds[:, :2] = np.clip(leds[:, :2], reach[:, :2] + low, np.maximum(high - reach[:, :2], reach[:, :2] + low))
+    pad, ceiling = sensor.gelpad, np.full(len(leds), CEILING)
+    for k in np.flatnonzero(p.virtual):
+        corner = np.minimum(1e-3 * (np.abs(leds[k, :2]) + reach[k, :2]), 0.5 * np.array(pad.size))
+        ceiling[k] = VIRTUAL_CEILING - 1e3 * pad.sag(*corner)
+    floor = 1e3 * sensor.case.floor_z + reach[:, 2]
+    leds[:, 2] = np.clip(leds[:, 2], floor, np.maximum(ceiling - reach[:, 2], floor))
+    return leds
+
+
+def _beside_view(sensor: SensorSpec, p: LightParameters) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest x and y [mm] of what LEDs reach, (L, 2) each."""
+    half = 5e2 * np.array(sensor.case.size)
+    low, high = (np.tile(sign * half, (len(p.leds), 1)) for sign in (-1, 1))
+    places = np.array([led.position for led in p.template.leds])
+    x_edges, y_edges = view_edges(sensor)
+    for k in np.flatnonzero(p.virtual):
+        x, y = places[k, :2]
+        beyond = [(x_edges[0] - x, 0, high, x_edges[0]), (x - x_edges[1], 0, low, x_edges[1])]
+        beyond += [(y_edges[0] - y, 1, high, y_edges[0]), (y - y_edges[1], 1, low, y_edges[1])]
+        _, axis, bound, edge = max(beyond, key=lambda side: side[0])
+        bound[k, axis] = 1e3 * edge
+    return low, high
+
+
+def _edges(leds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors of every LED's edges (``LedSpec.edges``), (L, 3) each."""
+    (sin_a, cos_a), (sin_e, cos_e) = ((np.sin(leds[:, k]), np.cos(leds[:, k])) for k in (3, 4))
+    u = np.stack([-sin_a, cos_a, np.zeros(len(leds))], axis=1)
+    return u, np.stack([-sin_e * cos_a, -sin_e * sin_a, cos_e], axis=1)

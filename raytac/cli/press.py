@@ -44,7 +44,7 @@ class PressArgs(ShadowOptions, SolverOptions):
     level: Annotated[str | None, named(PADS)] = None
     """Resolution of a soft pad's mesh, makes physics ipc; as the scene says, else coarse."""
     optics: Annotated[str, named(OPTICS.names)] = "raytrace"
-    """Optical mode: raytrace, taxim (a table, baked at first use), phong, mlp or unet (networks).
+    """Optical mode: raytrace, taxim (a table, baked at first use), phong, mlp or unet.
 
     A --calibration replaces the baked table; networks need weights. The options below that a mode has are fields of its configuration."""
     calibration: Path | None = None

@@ -13,9 +13,10 @@ from .image.config import PhongLight as PhongLight
 from .image.config import Unet as Unet
 from .image.mlp import MlpMode as MlpMode
 from .image.network_files import look_digest as look_digest
+from .image.network_files import view_size as view_size
 from .image.phong import PhongMode as PhongMode
 from .image.unet import UnetMode as UnetMode
-from .image.unet_network import UnetNetwork as UnetNetwork
+from .image.unet import new_unet as new_unet
 from .image.unet_weights import UnetWeights as UnetWeights
 from .image.unet_weights import load_unet as load_unet
 from .image.unet_weights import save_unet as save_unet

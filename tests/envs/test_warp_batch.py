@@ -148,7 +148,9 @@ def test_episodes_that_end_begin_again_and_leave_the_others_to_the_bit(device: s
         assert b.truncated.tolist() == [False, step == 4, False]
         for name, values in a.observation.items():
             tolerance = 0.0 if device == "cpu" else 1e-4
-            torch.testing.assert_close(values[[0, 2]], b.observation[name][[0, 2]], rtol=0.0, atol=tolerance, msg=f"{name}: {{}}".format)
+            torch.testing.assert_close(
+                values[[0, 2]], b.observation[name][[0, 2]], rtol=0.0, atol=tolerance, msg=f"{name}: {{}}".format
+            )
     assert other.steps.tolist() == [8, 3, 8] and not torch.equal(a.observation["state"][1], b.observation["state"][1])
 
 

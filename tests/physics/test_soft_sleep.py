@@ -9,7 +9,7 @@ from raytac.errors import InputError
 from raytac.physics.soft.bodies import ScenePad, scene_body
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
 from raytac.physics.soft.scene import SoftScene
-from raytac.physics.soft.sleep import Sleep
+from raytac.physics.soft.substeps import Sleep
 from raytac.se3 import rotations
 from raytac.shapes.part import primitive
 from raytac.specs import load_sensor

@@ -108,7 +108,10 @@ class Unet(OpticsConfig[Any]):
     """A small U-Net from the coat to the whole image, which may learn shadows; needs PyTorch."""
 
     weights: str | Path | UnetWeights | None = None
-    """The network, its file, or the folder of ``experiments/train_unet.py``; None is the shipped one, of the default Mini's look."""
+    """A network, its file, or the folder of ``experiments/train_unet.py``.
+
+    None is the shipped network, which has the default Mini's look.
+    """
 
     def maker(self) -> Any:
         return import_module("raytac.optics.image.unet").UnetMode

@@ -1,4 +1,4 @@
-"""What files of networks have in common: format and version, provenance, the view that they were fitted to."""
+"""Headers of networks' files: format and version, provenance, the view fitted to."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def view_size(sensor: SensorSpec) -> tuple[float, float]:
 
 
 def look_digest(sensor: SensorSpec) -> str:
-    """Digest of what a sensor's image depends on beside its coat's shape: lights, coat, case, camera and response."""
+    """Digest of a sensor's lights, coat, case, camera and response: all that shapes its image."""
     look = (sensor.lights, sensor.coat, sensor.case, sensor.camera, sensor.response, sensor.optics)
     return hashlib.sha256(repr(look).encode()).hexdigest()[:16]
 

@@ -1,7 +1,8 @@
-"""The optical mode ``unet``: the whole image by a small U-Net (``unet_weights``), in PyTorch."""
+"""Optical mode ``unet``: the whole image by a small U-Net (``unet_weights``), in PyTorch."""
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 import drjit as dr
@@ -19,7 +20,22 @@ from raytac.optics.image.unet_weights import UnetWeights, load_unet
 from raytac.optics.ink import darkened
 
 _ACTIVATIONS = 8
-"""Arrays of the finest level's channels that the network holds at its peak, coarser levels counted."""
+"""Peak number of arrays of the finest level's channels, coarser levels counted."""
+
+
+def new_unet(widths: tuple[int, ...], device: str) -> Any:
+    """A U-Net with random weights, a PyTorch module.
+
+    ``widths``: channels of every level, the finest first. Raises ``BackendError`` where PyTorch is not installed.
+    """
+    return _network_module().UnetNetwork(widths).to(device)
+
+
+def _network_module() -> Any:
+    try:
+        return import_module("raytac.optics.image.unet_network")
+    except ImportError as error:
+        raise BackendError(f"optics='unet' needs PyTorch ({error}): `pip install torch`") from error
 
 
 class UnetMode(DeviceMode):
@@ -34,17 +50,13 @@ class UnetMode(DeviceMode):
     config: Unet
 
     def _set_up(self) -> None:
-        try:
-            import torch
-
-            from raytac.optics.image.unet_network import network_of
-        except ImportError as error:
-            raise BackendError(f"optics='unet' needs PyTorch ({error}): `pip install torch`") from error
+        module = _network_module()
+        torch = import_module("torch")
         self.weights = self._own_weights()
         check_view("unet", self.sensor, self.weights.view, self.weights.provenance)
         height, width = self.weights.background.shape[:2]
         self._seeing = Pinhole.from_spec(self.sensor.camera, (width, height), self.slab)
-        self._torch, self._network = torch, network_of(self.weights, self.device)
+        self._torch, self._network = torch, module.network_of(self.weights, self.device)
         with torch.no_grad():
             background = torch.from_numpy(self.weights.background.astype(np.float32))[None].permute(0, 3, 1, 2).to(self.device)
             rest = self._network(torch.zeros((1, 4, height, width), device=self.device))
@@ -92,9 +104,10 @@ class UnetMode(DeviceMode):
         return self._torch.nn.functional.interpolate(levels, size=(height, width), **options)
 
     def maps(self, surface: GelSurface) -> Any:
-        """Maps (B, 4, H, W) that the network sees, a tensor: slopes along x and y, displacement [mm] and contact.
+        """Inputs of the network, a tensor (B, 4, H, W).
 
-        Environments whose heights are not finite are at rest. Errors as of ``render``.
+        They are slopes along x and y, displacement [mm] and contact. Environments whose heights are not finite are at rest.
+        Errors as of ``render``.
         """
         heights, failed = self._checked(surface)
         return self._seen_maps(self._upload(heights), self._upload_contact(surface, failed))

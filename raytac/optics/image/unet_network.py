@@ -1,5 +1,8 @@
 """The U-Net of ``unet_weights`` in PyTorch: its layers, its inputs, its arithmetic."""
 
+# pyright: reportMissingImports=false
+# (The tests do without PyTorch.)
+
 from __future__ import annotations
 
 import itertools
@@ -14,7 +17,7 @@ from raytac.optics.image.unet_weights import INPUTS, LEVELS, UnetWeights
 
 
 class UnetNetwork(nn.Module):
-    """Change of an image [levels], (B, 3, H, W), from maps (B, 4, H, W): slopes along x and y, displacement [mm], contact."""
+    """Change of an image [levels], (B, 3, H, W), from maps (B, 4, H, W) of ``UnetMode``."""
 
     def __init__(self, widths: tuple[int, ...]) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""A small U-Net from the coat to the image: its inputs, its layers, its file. Importing this loads no PyTorch.
+"""A small U-Net from the coat to the image: inputs, layers and file. It needs no PyTorch.
 
 Networks that map rendered contact to a sensor's image see whole pictures, so that they may learn shadows: the adversarial one of
 Kim et al. (Marker-embedded tactile image generation, RA-L 2023), a diffusion model of Higuera et al. (Learning to read braille,
@@ -36,7 +36,7 @@ _LARGEST, _DEEPEST = 256, 8
 
 @dataclass(frozen=True)
 class UnetWeights:
-    """Layers by name, and the image at rest [levels], (H, W, 3) uint8, whose size is the network's."""
+    """Weights of a U-Net, and the image at rest (H, W, 3) uint8, whose size is the network's."""
 
     widths: tuple[int, ...]
     """Channels at every level, the finest first."""
@@ -50,7 +50,7 @@ class UnetWeights:
 
 
 def layer_shapes(widths: tuple[int, ...]) -> dict[str, tuple[int, ...]]:
-    """Shapes of all arrays of a network: ``<layer>.weight`` (out, in, k, k) and ``<layer>.bias`` (out,)."""
+    """Shapes of all arrays: ``<layer>.weight`` (out, in, k, k) and ``<layer>.bias`` (out,)."""
     convolutions = {}
     for k, (above, own) in enumerate(itertools.pairwise((INPUTS, *widths))):
         convolutions |= {f"down{k}.0": (own, above, 3), f"down{k}.2": (own, own, 3)}

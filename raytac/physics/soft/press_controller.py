@@ -203,7 +203,9 @@ class PressController:
         return np.where(np.isfinite(self._force) & ~self.failed, self._force - self._solver.normal_force(), 0.0)
 
     def _rest(self) -> None:
-        """Let a free object come to rest under its weight: slow at two steps in succession, as at a turning point it is not."""
+        """Let a free object come to rest under its weight: slow at two steps in succession.
+
+        At a turning point it is slow at one step."""
         assert self._weight > 0.0
         self._solver.set_gravity(float(self._force[0]) / self._weight)
         is_slow = is_at_rest = np.zeros(self.num_envs, bool)

@@ -20,8 +20,7 @@ from raytac.physics.soft.mesh import pad_stiffness
 from raytac.physics.soft.reading import PadArrays, SoftReader, SoftReading
 from raytac.physics.soft.scene_state import Poses, SceneReport, SceneState
 from raytac.physics.soft.settings import SceneSettings
-from raytac.physics.soft.sleep import Sleep
-from raytac.physics.soft.substeps import Substeps
+from raytac.physics.soft.substeps import Sleep, Substeps
 from raytac.se3 import batch_of, inverse, nearest_rotation, quaternion, quaternions, rigid_poses
 
 _GRAVITY = 0.0, 0.0, -9.81

@@ -1,4 +1,4 @@
-"""Substeps of a soft scene: division of a step where something soft is near another body.
+"""Substeps of a soft scene near something soft, and sleep where nothing is near.
 
 Every environment divides its own step, as it would alone. What a rigid body does by itself near another rigid one does not divide
 it: where it slides, rolls or falls on a table it moves as far in one step as its speed takes it, and the solver's collision detection
@@ -23,6 +23,8 @@ from raytac.se3 import inverse, rotations, turn_angle
 
 Pair = tuple[str, str]
 _NOTHING = 1e-15
+_MARGIN = 2.0
+"""Distance that pads must keep during a step, in units of d̂: contact begins at one."""
 _CORNERS = np.array([[k & 1, k >> 1 & 1, k >> 2 & 1] for k in range(8)], float)
 
 
@@ -160,6 +162,45 @@ class Substeps:
         )
 
 
+class Sleep:
+    """Choice of the environments that sleep through a step.
+
+    An environment sleeps if three things hold: its gels and bodies came to rest, to the tolerance of the solver; no pad comes near anything
+    in the coming step, whatever its speed; and no driven body that moves comes near a free or soft one. Nothing else is remembered, so it
+    wakes in the step in which one of them does not hold.
+    """
+
+    def __init__(
+        self,
+        pads: Mapping[str, ScenePad],
+        bodies: Mapping[str, SceneBody],
+        substeps: Substeps,
+        world: ipc.World,
+        tolerance: float,
+    ) -> None:
+        """``tolerance``: largest displacement of a node from its place at rest [m]."""
+        self._substeps, self._world, self._tolerance = substeps, world, tolerance
+        self._margin = _MARGIN * world.d_hat
+        self._pad_pairs: list[Pair] = [*combinations(pads, 2), *product(pads, bodies)]
+        self._body_pairs: list[Pair] = []
+        for a, b in combinations(bodies.values(), 2):
+            if a.is_soft or b.is_soft or not (a.is_driven and b.is_driven):
+                self._body_pairs.append((b.name, a.name) if isinstance(a.solid, ipc.HalfSpace) else (a.name, b.name))
+
+    def choose(self, now: Poses, goal: Poses) -> np.ndarray:
+        """Environments (B,) that sleep while all that is driven goes from ``now`` to ``goal``."""
+        asleep = self._world.distance_from_rest() <= self._tolerance
+        if not asleep.any():
+            return asleep
+        motions = self._substeps.motions(now, goal, np.zeros(len(asleep)))
+        for a, b in self._pad_pairs:
+            asleep &= clear_of_each_other(motions[a], motions[b], self._margin)
+        for a, b in self._body_pairs:
+            still = _is_still(motions[a]) & _is_still(motions[b])
+            asleep &= still | clear_of_each_other(motions[a], motions[b], self._margin)
+        return asleep
+
+
 @dataclass(frozen=True)
 class BoxMotion:
     """Motion of a box, or of a half-space z <= 0 of its frame, in B environments."""
@@ -214,6 +255,11 @@ def clear_of_each_other(a: BoxMotion, b: BoxMotion, distance: float) -> np.ndarr
     """
     gaps = (_plane_gaps(a, b) if b.is_plane else _box_gaps(a, b))[0]
     return gaps.min(axis=0).max(axis=1) > distance
+
+
+def _is_still(motion: BoxMotion) -> np.ndarray:
+    """Environments (B,) in which a box does not move."""
+    return (motion.start == motion.end).all(axis=(1, 2))
 
 
 def _plane_gaps(a: BoxMotion, plane: BoxMotion) -> tuple[np.ndarray, ...]:

@@ -51,7 +51,7 @@ class Scene:
         s.x_start.assign((x if start is None else start)[None])
         s.dx.zero_()
         s.collision.refresh(s.x, s.dx, s.everyone)
-        s.collision.assemble(s.x, s.x_start, s.R, s.t, s.kappa, EPS, s.everyone, s.vert_gradient, s.barrier)
+        s.touch(s.everyone)
         return float(s.barrier.numpy()[0]), s.vert_gradient.numpy()[0].copy()
 
     def hessian(self) -> np.ndarray:
