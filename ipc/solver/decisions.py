@@ -22,8 +22,6 @@ SLOW = wp.constant(wp.float64(0.505))
 
 Half of it, and some rounding.
 """
-RENEWED = wp.constant(wp.int32(20))
-"""Most Newton iterations of a step's first solve after which friction is renewed."""
 
 
 @wp.kernel
@@ -318,8 +316,19 @@ def end_search(d: Decisions, f: Flags):
 
 
 @wp.kernel
-def conclude(tolerance: wp.float64, max_newton: wp.int32, max_relags: wp.int32, friction: wp.int32, d: Decisions, f: Flags):
-    """Ends an iteration: environments converge, give up, or have their friction lagged again."""
+def conclude(
+    tolerance: wp.float64,
+    max_newton: wp.int32,
+    max_relags: wp.int32,
+    renewals: wp.int32,
+    friction: wp.int32,
+    d: Decisions,
+    f: Flags,
+):
+    """Ends an iteration: environments converge, give up, or have their friction lagged again.
+
+    Friction is renewed within a step's first solve after each of its first ``renewals`` Newton iterations.
+    """
     env = wp.tid()
     if f.halt[0] != 0:
         return
@@ -328,7 +337,8 @@ def conclude(tolerance: wp.float64, max_newton: wp.int32, max_relags: wp.int32, 
         d.newton[env] = d.newton[env] + 1
         d.since_lag[env] = d.since_lag[env] + 1
         d.linear[env] = d.linear[env] + d.pcg_iterations[env]
-        d.last[env] = d.size[env]
+        if renewals > 0:
+            d.last[env] = d.size[env]
     if d.plain[env] != 0:
         d.ready[env] = 1
         slow = d.speed[env] <= tolerance
@@ -348,7 +358,7 @@ def conclude(tolerance: wp.float64, max_newton: wp.int32, max_relags: wp.int32, 
         d.active[env] = 0
     # Friction of a step's first solve follows its contacts: solved with that of the step's start, it would be solved for nothing.
     if friction != 0 and max_relags > 0 and d.plain[env] != 0 and d.active[env] != 0 and d.relags[env] == 0:
-        if d.since_lag[env] <= RENEWED:
+        if d.since_lag[env] <= renewals:
             d.pending[env] = 1
     # Where Newton gave up, forces are no better known after another lag; the first two may still help it on.
     if was_active != 0 and d.active[env] == 0 and friction != 0 and max_relags > 0:

@@ -39,6 +39,10 @@ from ipc.solver.preconditioners import make_preconditioner
 from ipc.solver.step_state import StepState
 
 
+_RENEWALS = 20
+"""Most Newton iterations of a step's first solve after which friction is renewed, in a world whose bodies are all held."""
+
+
 class Newton:
     """The step of a batch; it moves the state of ``potential``."""
 
@@ -51,6 +55,7 @@ class Newton:
         self.preconditioner = make_preconditioner(layout, settings, self.batch, lanes, self.device)
         self._still = wp.zeros_like(potential.x)
         self._friction = int(potential.collision.friction)
+        self._renewals = _RENEWALS if _is_held(layout) else 0
         self._loose = max(settings.linear_tolerance, settings.forcing)
         self._graphs: dict[str, Any] = {}
         """Recordings by name of what was recorded; None for what ran once as it stands."""
@@ -186,7 +191,8 @@ class Newton:
             wp.capture_if(f.advance, self._advance)
         wp.capture_if(f.plain, self._line_search)
         tolerance = settings.velocity_tolerance
-        state.launch(decisions.conclude, tolerance, settings.max_newton, settings.friction_relags, self._friction)
+        limits = settings.max_newton, settings.friction_relags, self._renewals
+        state.launch(decisions.conclude, tolerance, *limits, self._friction)
         self._set_flags()
 
     def _lag(self) -> None:
@@ -322,3 +328,13 @@ class Newton:
             wp.copy(pot.frame_q, pot.now_q)
             wp.copy(pot.frame_p, pot.t)
             pot.energies()
+
+
+def _is_held(layout: Layout) -> bool:
+    """True if no body is free: each that moves has bonded or gripped nodes, or a drive.
+
+    A free body slides and lands by its inertia. Its normal forces before Newton's method has balanced them say little of its friction.
+    """
+    held = (layout.node_free == 0) | (layout.node_drive > 0)
+    held[layout.grip_node] = True
+    return np.isin(layout.node_body, layout.node_body[held]).all().item()

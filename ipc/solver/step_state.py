@@ -94,7 +94,7 @@ class StepState:
 
     Args:
         project: mask of environments whose Hessian is made definite (B,).
-        last: largest displacement of a node in the last Newton step (B,) [m]; 0 before the first.
+        last: largest displacement of a node in the last Newton step (B,) [m]; 0 before the first, and where bodies are free.
         halt: flag that stops everything until buffers have grown.
     """
 
