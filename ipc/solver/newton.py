@@ -38,9 +38,8 @@ from ipc.solver.potential import Potential
 from ipc.solver.preconditioners import make_preconditioner
 from ipc.solver.step_state import StepState
 
-
 _RENEWALS = 20
-"""Most Newton iterations of a step's first solve after which friction is renewed, in a world whose bodies are all held."""
+"""Most renewals of friction within a step's first solve, where every body is held."""
 
 
 class Newton:
