@@ -2,10 +2,13 @@
 
     python experiments/train_unet.py --out runs/unet                                       # a GPU: some minutes
     python experiments/train_unet.py --count 60 --steps 30 --widths 4,8 --device cpu --out runs/unet_small
+    python experiments/train_unet.py --network scenes/networks/gelsight_mini_unet.npz --device cpu --out runs/unet_shipped
 
 The presses are those of a sweep (``network`` by default, docs/datasets.md), rendered in memory; nothing is stored but the network. Every
-tenth press is held out, and the presses of ``--unseen`` are of an object that the sweep does not have. Adam with a cosine from
-``--rate`` lowers the mean of |error|, in which contacts and 2 mm around them count ``--emphasis`` times.
+tenth press is held out, and the presses of ``--unseen`` are of an object that the sweep does not have. ``--network`` tests a network that
+is there already: on as many presses of the sweep as would be held out, drawn with another seed, and on the unseen object.
+
+Adam with a cosine from ``--rate`` lowers the mean of |error|, in which contacts and 2 mm around them count ``--emphasis`` times.
 
 ``unet.npz`` is the network, for ``optics=Unet(weights=…)``. ``metrics.json``: ``unet.<set>.<region>_mae`` [levels of 255] with the sets
 ``held_out`` and ``unseen`` and the regions ``contact``, ``ring`` (2 mm around) and ``frame``, beside ``none.…``, the image at rest;
@@ -20,6 +23,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,7 +35,7 @@ from raytac.device import resolve_device
 from raytac.errors import BackendError, InputError
 from raytac.gel import GelSurface, PadGrid
 from raytac.io import CommonOptions, Progress
-from raytac.optics import RayTraced, Unet, UnetMode, UnetWeights, look_digest, new_unet, save_unet, view_size
+from raytac.optics import RayTraced, Unet, UnetMode, UnetWeights, load_unet, look_digest, new_unet, save_unet, view_size
 from raytac.specs import SweepSpec, load_press, load_sweep
 
 HELD_OUT = 10
@@ -48,6 +52,8 @@ class Args(CommonOptions):
     """Name of a shipped sweep, or path of a sweep file."""
     count: int | None = None
     """Number of presses; the sweep's if not given."""
+    network: Path | None = None
+    """File of a network to test; nothing is fitted then."""
     unseen: str = "mesh"
     """Press scene whose object is only tested on, with a tenth of the sweep's presses."""
     widths: str = "12,24,36,48,64"
@@ -164,12 +170,34 @@ def milliseconds(mode: Any, surface: GelSurface, repeats: int = 30) -> float:
     return 1e3 * float(np.median(times[3:]))
 
 
+def fitted(
+    sweep: SweepSpec, presses: Presses, rest: np.ndarray, args: Args, reach: int, device: str, metrics: dict[str, Any]
+) -> UnetWeights:
+    """A network fitted to ``presses``, whose image at rest is ``rest`` (H, W, 3); adds what the fit took to ``metrics``."""
+    widths = _widths(args.widths)
+    sensor, plan = sweep.sensors[0], DatasetPlan(sweep)
+    network = new_unet(widths, device)
+    provenance = {"source": "ray-traced presses", "sensor": sensor.name, "look": look_digest(sensor)}
+    provenance |= {"sweep": args.sweep, "presses": str(len(presses)), "steps": str(args.steps)}
+    weights = UnetWeights(widths, network.layers(), rest, provenance, view_size(sensor))
+    mode = Unet(weights=weights).build(sensor, resolution=plan.resolution(sensor), device=device)
+    began = time.perf_counter()
+    trained(network, seen(mode, presses, plan.grid(sensor)), presses, rest, args, reach)
+    metrics |= {"unet.fit_s": time.perf_counter() - began, "presses": len(presses), "steps": args.steps, "batch": args.batch}
+    return dataclasses.replace(weights, layers=network.layers())
+
+
+def _widths(text: str) -> tuple[int, ...]:
+    widths = tuple(int(part) if part.isdigit() else 0 for part in text.split(","))
+    if min(widths) < 1:
+        raise InputError("widths", value=text, rule="must be whole numbers >= 1, joined by commas")
+    return widths
+
+
 def main(args: Args) -> None:
     for name, value in (("steps", args.steps), ("batch", args.batch)):
         check_whole(name, value)
-    widths = tuple(int(part) if part.isdigit() else 0 for part in args.widths.split(","))
-    if min(widths) < 1:
-        raise InputError("widths", value=args.widths, rule="must be whole numbers >= 1, joined by commas")
+    _widths(args.widths)
     try:
         import torch
     except ImportError as error:
@@ -182,39 +210,36 @@ def main(args: Args) -> None:
         check_whole("count", args.count, HELD_OUT)
         sweep = dataclasses.replace(sweep, count=args.count)
     device = resolve_device(args.device)
-    unseen = dataclasses.replace(
-        sweep, objects=(load_press(args.unseen),), count=max(sweep.count // HELD_OUT, 1), seed=sweep.seed + 1
-    )
+    tenth = max(sweep.count // HELD_OUT, 1)
+    unseen = dataclasses.replace(sweep, objects=(load_press(args.unseen),), count=tenth, seed=sweep.seed + 1)
+    weights = None if args.network is None else load_unet(args.network)
     with recorded(args, "train_unet", device=device, owned=("unet.npz",), packages=("torch",)) as (folder, metrics):
         torch.manual_seed(args.seed)
         sensor, plan = sweep.sensors[0], DatasetPlan(sweep)
         grid, size = plan.grid(sensor), plan.resolution(sensor)
-        presses, other = rendered(sweep, device), rendered(unseen, device)
         tracer = RayTraced().build(sensor, resolution=size, device=device)
         rest = tracer.render(GelSurface.at_rest(grid)).rgb
         assert rest is not None
-        network = new_unet(widths, device)
-        provenance = {"source": "ray-traced presses", "sensor": sensor.name, "look": look_digest(sensor)}
-        provenance |= {"sweep": args.sweep, "presses": str(len(presses)), "steps": str(args.steps)}
-        view = view_size(sensor)
-        weights = UnetWeights(widths, network.layers(), rest[0], provenance, view)
         reach = round(RING / sensor.camera.pitch_at(size)[0])
-        held_out = np.arange(len(presses)) % HELD_OUT == HELD_OUT - 1
+        if weights is None:
+            presses = rendered(sweep, device)
+            held_out = np.arange(len(presses)) % HELD_OUT == HELD_OUT - 1
+            tested = presses.rows(held_out)
+            weights = fitted(sweep, presses.rows(~held_out), rest[0], args, reach, device, metrics)
+            save_unet(weights, folder / "unet.npz")
+            weights = load_unet(folder / "unet.npz")
+        else:
+            tested = rendered(dataclasses.replace(sweep, count=tenth, seed=sweep.seed + 2), device)
         mode = Unet(weights=weights).build(sensor, resolution=size, device=device)
-        began = time.perf_counter()
-        trained(network, seen(mode, presses.rows(~held_out), grid), presses.rows(~held_out), rest[0], args, reach)
-        metrics |= {"unet.fit_s": time.perf_counter() - began, "presses": len(presses), "steps": args.steps, "batch": args.batch}
-        save_unet(dataclasses.replace(weights, layers=network.layers()), folder / "unet.npz")
-        mode = Unet(weights=folder / "unet.npz").build(sensor, resolution=size, device=device)
-        for name, tested in (("held_out", presses.rows(held_out)), ("unseen", other)):
-            metrics |= {key.format(name): value for key, value in errors(mode, tested, grid, rest[0], reach).items()}
+        other = rendered(unseen, device)
+        for name, part in (("held_out", tested), ("unseen", other)):
+            metrics[f"{name}.presses"] = len(part)
+            metrics |= {key.format(name): value for key, value in errors(mode, part, grid, rest[0], reach).items()}
         one = other.rows(slice(0, 1)).surface(grid)
         metrics |= {"unet.ms": milliseconds(mode, one), "raytrace.ms": milliseconds(tracer, one)}
-        metrics |= {
-            "unet.kilobytes": (folder / "unet.npz").stat().st_size / 1e3,
-            "unet.numbers": sum(a.size for a in network.layers().values()),
-        }
-        metrics |= {f"widths.{k}": width for k, width in enumerate(widths)}
+        file = folder / "unet.npz" if args.network is None else args.network
+        metrics |= {"unet.kilobytes": file.stat().st_size / 1e3, "unet.numbers": sum(a.size for a in weights.layers.values())}
+        metrics |= {f"widths.{k}": width for k, width in enumerate(weights.widths)}
         for key, value in metrics.items():
             if key.endswith(("_mae", ".ms", ".kilobytes")):
                 print(f"{key:32} {value:8.2f}")
