@@ -57,7 +57,7 @@ def tip_displacement(young: float, poisson: float, cells: int, *, plane_strain: 
     free[0] = False
     keep = np.flatnonzero(free.ravel())
     u = np.zeros(2 * n * n)
-    u[keep] = spsolve(matrix[keep][:, keep].tocsc(), load.ravel()[keep])
+    u[keep] = np.asarray(spsolve(matrix[keep][:, keep].tocsc(), load.ravel()[keep]))
     return float(u.reshape(n, n, 2)[-1, cells, 1])
 
 
