@@ -3,7 +3,7 @@
     python experiments/train_unet.py --out runs/unet                                       # a GPU: some minutes
     python experiments/train_unet.py --count 60 --steps 30 --widths 4,8 --device cpu --out runs/unet_small
 
-The presses are those of a sweep (``network`` by default, docs/datasets.md), rendered in memory; nothing is stored but the network. Every
+The presses are those of a sweep (``network`` by default, docs/guide/data-sets.md), rendered in memory. Only the network is stored. Every
 tenth press is held out, and the presses of ``--unseen`` are of an object that the sweep does not have. Adam with a cosine from
 ``--rate`` lowers the mean of |error|, in which contacts and 2 mm around them count ``--emphasis`` times.
 
