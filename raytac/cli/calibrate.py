@@ -60,7 +60,7 @@ class CalibrateArgs(FitOptions, SolverOptions):
     shadows: bool = False
     """Let the ray tracer cast shadows on the coat in the fit, and in sensor.toml."""
     shadow_table: Literal["none", "raytrace"] = "none"
-    """Shadows of --model taxim: none, or of pins in the fitted ray tracer (docs/guide/calibrate.md)."""
+    """Shadows of --model taxim: none, or of pins in the fitted ray tracer."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file; it needs no markers of its own."""
     level: Annotated[str, named(PADS)] = "medium"
