@@ -1,4 +1,4 @@
-"""The Franka Panda, ours or the menagerie's, with tactile sensors; see docs/reference/panda.md."""
+"""The Franka Panda, ours or the menagerie's, with tactile sensors (docs/guide/robots.md)."""
 
 from __future__ import annotations
 
