@@ -18,8 +18,12 @@ PAGES = [
     path for path in (*sorted(ROOT.glob("*.md")), *(ROOT / folder / "README.md" for folder in ("scenes", "ipc"))) if path.exists()
 ]
 PAGES += sorted(DOCS.rglob("*.md"))
-GENERATED = {"reference/command-line.md", "reference/files.md"}
-"""Pages that the site's build writes (``docs/build.py``); other pages may link to them."""
+SOURCES = [
+    path
+    for folder in ("raytac", "ipc", "scenes", "lights", "experiments", "examples", "tests")
+    for path in sorted((ROOT / folder).rglob("*"))
+    if path.suffix in (".py", ".pyi", ".toml", ".xml")
+]
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
@@ -64,11 +68,19 @@ def test_links_lead_to_files_and_headings(path: Path) -> None:
             continue
         name, _, anchor = link.partition("#")
         target = (path.parent / name).resolve() if name else path
-        if target.is_relative_to(DOCS) and target.relative_to(DOCS).as_posix() in GENERATED:
-            continue
         if not target.exists() or (anchor and anchor not in anchors(target.read_text(encoding="utf-8"))):
             broken.append(link)
     assert broken == []
+
+
+def test_pages_that_the_code_names_exist() -> None:
+    named = {
+        (path.relative_to(ROOT).as_posix(), page)
+        for path in SOURCES
+        for page in re.findall(r"\bdocs/[\w/-]+\.md", path.read_text("utf-8"))
+    }
+    assert len(named) > 20
+    assert sorted(f"{path}: {page}" for path, page in named if not (ROOT / page).exists()) == []
 
 
 def test_the_readme_is_one_page() -> None:
