@@ -7,7 +7,7 @@ OUT ?= runs/demo
 # Compiled modules are kept, also where a container's image switches that off: tests start some hundred processes.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo check test test-random suite quick lint rules types clean
+.PHONY: demo check test test-random suite quick lint rules types docs clean
 
 TEST := $(BIN)/python -m pytest
 # The installation goes before what then runs beside each other.
@@ -52,8 +52,13 @@ $(VENV)/.types: $(SOURCES) pyproject.toml
 	$(BIN)/pyright $(filter %.py,$?)
 	@touch $@
 
+# The documents as a site, site/index.html; a warning is an error. Nothing is fetched while it builds.
+docs: $(VENV)/.installed-docs
+	$(BIN)/python docs/build/pages.py .site
+	$(BIN)/zensical build --strict --clean --config-file mkdocs.yml
+
 clean:
-	rm -rf $(VENV) runs build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) runs build dist site .site .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 
 # The stamps are written last, so an interrupted install is repeated and a finished one is not.
 $(VENV)/.installed: pyproject.toml
@@ -67,4 +72,8 @@ $(VENV)/.installed: pyproject.toml
 
 $(VENV)/.installed-test: $(VENV)/.installed pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[test]'
+	@touch $@
+
+$(VENV)/.installed-docs: $(VENV)/.installed pyproject.toml
+	@$(BIN)/python -m pip install --quiet --editable '.[docs]'
 	@touch $@

@@ -49,7 +49,7 @@ from raytac.errors import InputError, RaytacError
 from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, result_folder, versions, write_metrics
 
 CUT: ipc.Cut = "alike"
-"""Cells of the pad (``ipc.box_mesh``): docs/performance.md has figures of these, also pyuipc's."""
+"""Cells of the pad (``ipc.box_mesh``): docs/measurements/contact-solver.md has figures of these, also pyuipc's."""
 BATCHED = 1400
 """The most vertices that are measured with more than one environment."""
 

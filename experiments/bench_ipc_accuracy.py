@@ -7,7 +7,7 @@ The press of ``bench_ipc.py`` for each mesh and velocity tolerance; at the end o
 the ``--reference`` mesh (mirrored cells) at ``--reference-tolerance`` and a linear tolerance of 1e-4, on a common grid of 0.1 mm: under
 the contact (as far out as the reference carries load) and around it (twice as far). The sphere, d̂ and κ are the same in all of them, so
 neither its facets nor the stand-off count as error. ``ipc.box_mesh`` says how cells are cut ``alike`` and ``mirrored``. The reference is
-kept in DIR/references by content. docs/performance.md says what came out.
+kept in DIR/references by content. docs/measurements/contact-solver.md says what came out.
 """
 
 from __future__ import annotations

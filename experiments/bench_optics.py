@@ -5,7 +5,7 @@ Every frame has a new surface, and everything from the height field to the 8-bit
     python experiments/bench_optics.py --out runs/bench_optics                      # about 20 minutes on two cores
     python experiments/bench_optics.py --out runs/bench_cuda --device cuda --parts speed,error
 
-docs/performance.md explains the figures. References are kept in DIR/references by content, so that an interrupted run goes on.
+docs/measurements/image-modes.md explains the figures. References are kept in DIR/references by content, so that an interrupted run goes on.
 """
 
 from __future__ import annotations

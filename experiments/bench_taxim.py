@@ -5,7 +5,7 @@ Every frame has a new surface, and everything from the height field to the 8-bit
     python experiments/bench_taxim.py --out runs/bench_taxim                       # CPU
     python experiments/bench_taxim.py --out runs/bench_taxim_cuda --device cuda
 
-docs/taxim-table.md explains the figures. The table is baked first, unless the cache has it. The package taxim joins as a peer if it is
+docs/measurements/image-modes.md has the figures. The table is baked unless the cache has it. The package taxim joins as a peer if it is
 installed (``pip install taxim[jax-cpu]``); it is timed with its own sensor, and its time includes its own deformation of the gel.
 """
 

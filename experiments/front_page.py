@@ -2,7 +2,7 @@
 
     python experiments/front_page.py --data GELSLAM_MINI --out runs/front_page
 
-``--data`` is a folder of photographs of balls pressed into a real GelSight Mini (docs/real-images.md). The lights are fitted to four of
+``--data`` is a folder of photographs of balls pressed into a real GelSight Mini (docs/guide/calibrate.md). The lights are fitted to four of
 five presses, as one fold of ``raytac compare-real``; the press that is shown is among the fifth, which the fit has not seen. The fit takes
 minutes on a GPU and longer on a CPU.
 """

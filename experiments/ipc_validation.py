@@ -3,7 +3,7 @@
     python experiments/ipc_validation.py --out runs/ipc_validation              # three meshes each, some minutes on two cores
     python experiments/ipc_validation.py --parts hertz --cells 4,6 --out runs/x # quicker
 
-Writes metrics.json and force_depth.png. ``docs/ipc.md`` says what the figures mean.
+Writes metrics.json and force_depth.png. ``docs/measurements/contact-solver.md`` says what the figures mean.
 """
 
 from __future__ import annotations

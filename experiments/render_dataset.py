@@ -4,7 +4,7 @@
     python experiments/render_dataset.py my_sweep.toml --out presses --engine ray --workers 8
     python experiments/render_dataset.py --verify --out presses
 
-Killed at any time, the same command goes on where it stopped. docs/datasets.md describes sweeps, files and the loader.
+Killed at any time, the same command goes on where it stopped. docs/guide/data-sets.md describes sweeps, files and the loader.
 """
 
 from __future__ import annotations

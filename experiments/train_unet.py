@@ -4,7 +4,7 @@
     python experiments/train_unet.py --count 60 --steps 30 --widths 4,8 --device cpu --out runs/unet_small
     python experiments/train_unet.py --network scenes/networks/gelsight_mini_unet.npz --device cpu --out runs/unet_shipped
 
-The presses are those of a sweep (``network`` by default, docs/datasets.md), rendered in memory; nothing is stored but the network. Every
+The presses are those of a sweep (``network`` by default, docs/guide/data-sets.md), rendered in memory. Only the network is stored. Every
 tenth press is held out, and the presses of ``--unseen`` are of an object that the sweep does not have. ``--network`` tests a network that
 is there already: on as many presses of the sweep as would be held out, drawn with another seed, and on the unseen object.
 

@@ -36,7 +36,7 @@ class Settings:
         forcing: the same of the other linear solves [-]; 0: that of ``linear_tolerance``, which is the least.
         max_linear: PCG iterations a solve.
         preconditioner: of PCG: ``"block_jacobi"``, ``"rest_inverse"`` (bonded bodies' rest matrix inverted once, contacts as a low-rank
-            part; ``docs/ipc-preconditioners.md``), or ``"auto"``, whichever was measured to be faster on the device.
+            part; ``docs/concepts/preconditioners.md``), or ``"auto"``, whichever was measured to be faster on the device.
         max_line_search: halvings a line search; when none lowers the energy the step is not taken, and the report says so.
         armijo: share of the decrease that the slope promises which a step must achieve to be accepted [-].
         ccd_slack: share of a gap that a Newton step has to leave [-].

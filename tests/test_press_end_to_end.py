@@ -128,7 +128,7 @@ def test_another_sensor_needs_no_python(tmp_path: Path) -> None:
 def run_snippets(page: str, numbers: tuple[int, ...], folder: Path, monkeypatch: pytest.MonkeyPatch) -> TactileFrame:
     """Last frame of Python blocks of a page, run on the CPU: a process has one device, and the other tests of this one use it."""
     snippets = re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), flags=re.S)
-    assert len(snippets) == {"README.md": 2, "docs/first-steps.md": 3}[page]
+    assert len(snippets) == {"README.md": 2, "docs/guide/first-steps.md": 3}[page]
     monkeypatch.chdir(folder)  # shipped scenes are found from anywhere
     names: dict[str, object] = {"raytac": raytac}
     for number in numbers:
@@ -146,14 +146,14 @@ def test_the_readmes_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_the_first_python_of_the_first_steps_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    frame = run_snippets("docs/first-steps.md", (0,), tmp_path, monkeypatch)
+    frame = run_snippets("docs/guide/first-steps.md", (0,), tmp_path, monkeypatch)
     assert frame.rgb.shape == (1, 240, 320, 3) and frame.rgb.dtype == np.uint8
     assert frame.depth.shape == (1, 240, 320) and frame.depth.dtype == np.float32
     assert frame.force.shape == (1, 3)
 
 
 def test_the_soft_pad_of_the_first_steps_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    frame = run_snippets("docs/first-steps.md", (1,), tmp_path, monkeypatch)
+    frame = run_snippets("docs/guide/first-steps.md", (1,), tmp_path, monkeypatch)
     assert frame.wrench[0, 2] < -1.0
     assert frame.traction[0, ..., 2].min() < -1e4
     assert frame.markers.displacement_px.shape == (1, 63, 2)
@@ -161,6 +161,6 @@ def test_the_soft_pad_of_the_first_steps_runs(tmp_path: Path, monkeypatch: pytes
 
 
 def test_the_world_of_the_first_steps_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    frame = run_snippets("docs/first-steps.md", (2,), tmp_path, monkeypatch)
+    frame = run_snippets("docs/guide/first-steps.md", (2,), tmp_path, monkeypatch)
     assert frame.markers.displacement_px.shape == (1, 99, 2)
     assert not frame.wrench.any()  # the pad starts clear of the ball

@@ -1,4 +1,4 @@
-"""Links and files of the README and the documents."""
+"""Links, anchors and files of the README and the documents."""
 
 from __future__ import annotations
 
@@ -11,8 +11,39 @@ import pytest
 from raytac.specs import load_press
 
 ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-FIRST_STEPS = (ROOT / "docs" / "first-steps.md").read_text(encoding="utf-8")
+FIRST_STEPS = (DOCS / "guide" / "first-steps.md").read_text(encoding="utf-8")
+PAGES = [
+    path for path in (*sorted(ROOT.glob("*.md")), *(ROOT / folder / "README.md" for folder in ("scenes", "ipc"))) if path.exists()
+]
+PAGES += sorted(DOCS.rglob("*.md"))
+SOURCES = [
+    path
+    for folder in ("raytac", "ipc", "scenes", "lights", "experiments", "examples", "tests")
+    for path in sorted((ROOT / folder).rglob("*"))
+    if path.suffix in (".py", ".pyi", ".toml", ".xml")
+]
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+
+
+def prose(text: str) -> str:
+    """Text without blocks and spans of code, whose brackets are no links."""
+    return re.sub(r"`[^`\n]*`", "", re.sub(r"^```.*?^```", "", text, flags=re.S | re.M))
+
+
+def anchors(text: str) -> set[str]:
+    """Anchors of a page's headings, as GitHub and the site make them."""
+    result: set[str] = set()
+    for heading in re.findall(r"^#{1,6} +(.+?)\s*$", re.sub(r"^```.*?^```", "", text, flags=re.S | re.M), flags=re.M):
+        words = re.sub(r"\]\([^)]*\)", "", heading).lower()
+        result.add(re.sub(r"[^\w\- ]", "", words).replace(" ", "-"))
+    return result
+
+
+def test_anchors_are_those_of_the_headings() -> None:
+    text = "# The gel, [bonded](a.md) `now`\n```\n# no heading\n```\n## Zwei Größen: λ′ = μ/4\n"
+    assert anchors(text) == {"the-gel-bonded-now", "zwei-größen-λ--μ4"}
 
 
 def test_the_mesh_scene_of_the_first_steps_loads(tmp_path: Path) -> None:
@@ -24,16 +55,32 @@ def test_the_mesh_scene_of_the_first_steps_loads(tmp_path: Path) -> None:
 
 
 def test_every_page_is_linked_from_the_index() -> None:
-    pages = {path.name for path in (ROOT / "docs").glob("*.md")} - {"index.md"}
-    links = set(re.findall(r"\]\(([^)#]+)\)", (ROOT / "docs" / "index.md").read_text(encoding="utf-8")))
-    assert pages <= links
+    pages = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")} - {"index.md"}
+    links = {link.partition("#")[0] for link in LINK.findall((DOCS / "index.md").read_text(encoding="utf-8"))}
+    assert pages <= links, f"link these from docs/index.md: {sorted(pages - links)}"
 
 
-@pytest.mark.parametrize("path", [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))], ids=lambda path: path.name)
-def test_links_lead_to_files(path: Path) -> None:
-    links = re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", path.read_text(encoding="utf-8"))
-    broken = [link for link in links if not link.startswith("http") and not (path.parent / link).exists()]
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_links_lead_to_files_and_headings(path: Path) -> None:
+    broken = []
+    for link in LINK.findall(prose(path.read_text(encoding="utf-8"))):
+        if link.startswith(("http://", "https://", "mailto:")):
+            continue
+        name, _, anchor = link.partition("#")
+        target = (path.parent / name).resolve() if name else path
+        if not target.exists() or (anchor and anchor not in anchors(target.read_text(encoding="utf-8"))):
+            broken.append(link)
     assert broken == []
+
+
+def test_pages_that_the_code_names_exist() -> None:
+    named = {
+        (path.relative_to(ROOT).as_posix(), page)
+        for path in SOURCES
+        for page in re.findall(r"\bdocs/[\w/-]+\.md", path.read_text("utf-8"))
+    }
+    assert len(named) > 20
+    assert sorted(f"{path}: {page}" for path, page in named if not (ROOT / page).exists()) == []
 
 
 def test_the_readme_is_one_page() -> None:

@@ -96,7 +96,7 @@ def box_mesh(x: ArrayLike, y: ArrayLike, z: ArrayLike, cut: Cut = "mirrored") ->
             - ``"mirrored"``: each cell is the mirror image of its neighbours, in all three directions. Two by two by two cells are the
               barycentric subdivision of a cube, as the Powell-Sabin split is of a triangle; there, continuous piecewise linear fields
               without divergence approximate well (S. Zhang, J. Comput. Math. 26, 2008, in two dimensions; in three this is measured,
-              not proven). Locks little where ν nears 0.5; docs/soft-pad.md has figures.
+              not proven). Locks little where ν nears 0.5; docs/measurements/soft-pad.md has figures.
             - ``"alike"``: all diagonals are parallel, but for a reflection in the middle of x and of y. Locks where ν nears 0.5.
 
             With even cell counts in x and y either mesh is symmetric about its middle planes, if the grid lines are.

@@ -23,7 +23,7 @@ from raytac.specs.sensor import SensorSpec
 EDGE = 0.05
 """Half the width of the step that ``edge_radius`` looks for, over the radius.
 
-Circles of ``find_circles`` with it are labels' own in the mean, those with its 8 % are 2 % wider (docs/real-images.md)."""
+Circles of ``find_circles`` with it are labels' own in the mean, those with its 8 % are 2 % wider (docs/concepts/calibration.md)."""
 _ANGLES = 96
 _RADII = 400
 _TOLERANCE = 0.002

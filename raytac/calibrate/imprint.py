@@ -24,7 +24,7 @@ KNOTS = np.array([0.0, 0.3, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5, 1.75, 
 RIGID_PAD = np.array([0.3, 0.6, 0.7, 0.8, 0.9, 0.86, 0.49, 0.39, 0.26, 0.16, 0.05, 0.01, 0.0])
 """s at the inner knots where a fit starts.
 
-They are about the rigid pad's at the depth where its contact is as wide as the circle (docs/rigid-pad.md)."""
+They are about the rigid pad's at the depth where its contact is as wide as the circle (docs/concepts/rigid-pad.md)."""
 WIDEST = 0.95
 """Largest sine of a slope."""
 _TABLE = np.linspace(0, KNOTS[-1], 751)

@@ -13,7 +13,7 @@ from raytac.specs import LedSpec, LightsSpec, SensorSpec
 from raytac.specs.sensor_check import led_corners, validate_sensor
 
 GAMMA, VIGNETTE = 1.4, -0.1
-"""Exponent and first coefficient of the vignette where every fit begins (docs/accuracy.md)."""
+"""Exponent and first coefficient of the vignette where fits begin (docs/guide/calibrate.md)."""
 SHAPE_TOLERANCE = 0.01
 """Most that the ratio of sides of photographs may differ from the sensor's."""
 SIDES = {"red": (0.0, -1.0), "green": (1.0, 0.0), "blue": (0.0, 1.0)}

@@ -41,7 +41,7 @@ _OF_MARKERS = ("level", "quick", "verbose")
 class CalibrateArgs(FitOptions, SolverOptions):
     """Fit a sensor's optics to photographs of presses, or its marker motion to the soft pad.
 
-    With a data set (docs/real-images.md), --model raytrace writes lights.toml and sensor.toml, --model taxim a calibration folder and
+    With a data set (docs/guide/calibrate.md), --model raytrace writes lights.toml and sensor.toml, --model taxim a calibration folder and
     --model mlp mlp.npz, each beside circles.csv and metrics.json, which says data, split, errors and date. Every fifth press is held
     out and scored. Without --out the folder is runs/calibrate/MODEL/SENSOR. An error or Ctrl-C leaves the folder as it was.
 
@@ -60,7 +60,7 @@ class CalibrateArgs(FitOptions, SolverOptions):
     shadows: bool = False
     """Let the ray tracer cast shadows on the coat in the fit, and in sensor.toml."""
     shadow_table: Literal["none", "raytrace"] = "none"
-    """Shadows of --model taxim: none, or of pins in the fitted ray tracer (docs/taxim-table.md)."""
+    """Shadows of --model taxim: none, or of pins in the fitted ray tracer."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file; it needs no markers of its own."""
     level: Annotated[str, named(PADS)] = "medium"

@@ -25,7 +25,7 @@ class CompareRealArgs(FitOptions):
     """
 
     data: Annotated[Path, tyro.conf.Positional]
-    """Folder of photographs or dataPack.npz (docs/real-images.md)."""
+    """Folder of photographs or dataPack.npz (docs/guide/calibrate.md)."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
     folds: int = 5
@@ -39,7 +39,7 @@ class CompareRealArgs(FitOptions):
     shadows: bool = False
     """Let the ray tracer cast shadows on the coat; a real Mini shows next to none."""
     imprint: str = "fitted"
-    """Imprints to compare, joined by commas: fitted, rigid, ipc (docs/real-images.md).
+    """Imprints to compare, joined by commas: fitted, rigid, ipc (docs/guide/calibrate.md).
 
     Under rigid and ipc the pad's physics gives the gel's surface, at the depth where the edge of the imprint is as wide as the label's
     circle, and lights are fitted under the rigid pad's profile of slopes."""

@@ -25,7 +25,7 @@ from raytac.specs.sensor import AUTO
 from raytac.warp_messages import quiet_warp
 
 FROM_SCRATCH = "12,8,9"
-"""Numbers of LEDs of the Mini's main figures in docs/accuracy.md.
+"""Numbers of LEDs of the Mini's main figures in docs/measurements/photographs.md.
 
 Priors hold a fit to its start, and the shipped sensors' own lights were fitted to photographs: begun from these, presses that are
 held out would not be new to it."""
@@ -122,7 +122,7 @@ class FitOptions(CommonOptions):
 
     Each row has all LEDs. If not given, one row, at -7 or where the sensor's own are."""
     virtual: bool = False
-    """Declare the LEDs virtual sources (docs/real-images.md).
+    """Declare the LEDs virtual sources (docs/guide/calibrate.md).
 
     They stand for light that entered gel and plate at their sides, and may lie beside the view up to the coat, which LEDs of glass
     and metal may not."""
@@ -131,7 +131,7 @@ class FitOptions(CommonOptions):
     rounds: int = 3
     """Rounds with the ray tracer after direct light."""
     prior: str = INNER
-    """Strength of the LEDs' priors: free, tied, tied-dark, tied-darkest (docs/real-images.md).
+    """Strength of the LEDs' priors: free, tied, tied-dark or tied-darkest.
 
     Or `inner`, which chooses by cross-validation between halves of the pad within the presses that are fitted to."""
 

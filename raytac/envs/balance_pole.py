@@ -58,7 +58,7 @@ class BalancePoleEnv(TactileEnv):
     Action, Box(-1, 1, (2,)): displacement of the pad's target along world x and y (2 mm a step at 1). The target leads the pad by at most
     20 mm along an axis and stays in x 0.35 to 0.55, y ±0.10 m.
 
-    `action="joints"`: see docs/rl.md. A step is 20 ms.
+    `action="joints"`: see docs/guide/learning.md. A step is 20 ms.
 
     Observations, float32:
 
@@ -68,7 +68,7 @@ class BalancePoleEnv(TactileEnv):
     - `body` (15,): of the pole, position from the tool / 0.1 m (3), first two columns of its rotation (6), velocity [m/s] and angular
       velocity [rad/s] (6); only with `body_seen=True`: without it the pole is known by touch alone;
     - `sensor_markers` (192, 2): displacements of the markers / 1 mm, which show where the pole stands. `tactile=` selects others
-      (docs/rl.md);
+      (docs/guide/learning.md);
     - `sensor_wrench` (6,): force on the pad / 10 N and torque / 0.1 N m. A thin rod that pivots on its foot pushes
       sideways with 3/4 m g θ (for small θ), less the force of the pad's own acceleration, so that three steps determine the lean.
 

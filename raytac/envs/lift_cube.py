@@ -65,7 +65,7 @@ class LiftCubeEnv(TactileEnv):
     Action, Box(-1, 1, (4,)): displacement of the target of the point between the pads along world x, y, z (5 mm a step at 1), and change
     of the commanded opening (4 mm). The target leads the tool by at most 15 mm along an axis and stays in x 0.30 to 0.60,
     y ±0.15, z 0.012 to 0.30 m; the opening stays in 20 to 50 mm.
-    `action="joints"`: see docs/rl.md. A step is 20 ms.
+    `action="joints"`: see docs/guide/learning.md. A step is 20 ms.
 
     Observations, float32:
 
@@ -74,7 +74,7 @@ class LiftCubeEnv(TactileEnv):
     - `goal` (3,): goal from the tool / 0.1 m, world axes;
     - `body` (15,): of the cube, position from the tool / 0.1 m (3), first two columns of its rotation (6), velocity [m/s] and angular
       velocity [rad/s] (6); there unless `body_seen=False`;
-    - `left_markers`, `right_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` selects others (docs/rl.md).
+    - `left_markers`, `right_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` selects others (docs/guide/learning.md).
 
     Reward: sum of the terms in `info["reward_terms"]`, those of Isaac Lab's Isaac-Lift-Cube-Franka-v0 and three that lead up to them.
     Held: both pads are pressed with more than 0.5 N. r rises from 0 where the cube's centre is 15.5 mm high, which is a hair above rest,

@@ -66,7 +66,7 @@ class OpenDrawerEnv(TactileEnv):
     Action, Box(-1, 1, (4,)): displacement of the target of the point between the pads along world x, y, z (4 mm a step at 1), and change
     of the commanded opening (4 mm). The target leads the tool by at most 10 mm along an axis and stays in x 0.32 to 0.50,
     y ±0.05, z 0.030 to 0.12 m; the opening stays in 6 to 60 mm.
-    `action="joints"`: see docs/rl.md. A step is 20 ms.
+    `action="joints"`: see docs/guide/learning.md. A step is 20 ms.
 
     Observations, float32:
 
@@ -75,7 +75,7 @@ class OpenDrawerEnv(TactileEnv):
     - `goal` (3,): where the handle is to be, from the tool / 0.1 m, world axes;
     - `body` (15,): of the drawer, position from the tool / 0.1 m (3), first two columns of its rotation (6), velocity [m/s] and angular
       velocity [rad/s] (6); there unless `body_seen=False`;
-    - `left_markers`, `right_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` selects others (docs/rl.md).
+    - `left_markers`, `right_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` selects others (docs/guide/learning.md).
 
     Reward: sum of the terms in `info["reward_terms"]`, all ours; h the place at which the handle is held, g the goal.
 

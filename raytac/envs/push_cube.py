@@ -63,7 +63,7 @@ class PushCubeEnv(TactileEnv):
 
     Action, Box(-1, 1, (3,)): displacement of the pad's target along world x, y (3 mm a step at 1) and z (1 mm). The target leads the pad
     by at most 6 mm along an axis and stays in x 0.25 to 0.65, y ±0.25, z 0.035 to 0.10 m.
-    `action="joints"`: see docs/rl.md. A step is 20 ms.
+    `action="joints"`: see docs/guide/learning.md. A step is 20 ms.
 
     Observations, float32:
 
@@ -72,7 +72,7 @@ class PushCubeEnv(TactileEnv):
     - `goal` (3,): goal from the tool / 0.1 m, world axes;
     - `body` (15,): of the cube, position from the tool / 0.1 m (3), first two columns of its rotation (6), velocity [m/s] and angular
       velocity [rad/s] (6); there unless `body_seen=False`;
-    - `sensor_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` selects others (docs/rl.md).
+    - `sensor_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` selects others (docs/guide/learning.md).
 
     Reward: sum of the terms in `info["reward_terms"]`; d distances in m, a the action, q̇ joint speeds in rad/s.
 

@@ -52,7 +52,7 @@ class RollBallEnv(TactileEnv):
 
     Action, Box(-1, 1, (3,)): displacement of the pad's target along world x, y (2 mm a step at 1) and z (1 mm). The target leads the pad
     by at most 4 mm along an axis and stays in x 0.40 to 0.50, y ±0.05, z 0.007 to 0.02 m.
-    `action="joints"`: see docs/rl.md. A step is 20 ms.
+    `action="joints"`: see docs/guide/learning.md. A step is 20 ms.
 
     Observations, float32:
 
@@ -61,7 +61,7 @@ class RollBallEnv(TactileEnv):
     - `goal` (3,): goal from the tool / 0.1 m, world axes;
     - `body` (15,): of the ball, position from the tool / 0.1 m (3), first two columns of its rotation (6), velocity [m/s] and angular
       velocity [rad/s] (6); only with `body_seen=True`;
-    - `sensor_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` selects others (docs/rl.md).
+    - `sensor_markers` (99, 2): displacements of the markers / 1 mm. `tactile=` selects others (docs/guide/learning.md).
 
     Reward: sum of the terms in `info["reward_terms"]`, those of TacEx's ball rolling, with its constants unless a difference is given.
     d = d_xy(ball, goal). Touching: the pad is pressed with 0.05 to 5 N (TacEx: a depth of 0.5 to 4 mm).

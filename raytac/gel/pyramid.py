@@ -45,7 +45,7 @@ class ElasticSurround:
 
     - ``"unilateral"`` (default): ``LAYER_STEPS`` in units of the gel's thickness, w ← max(w, u⁺). The gel never reaches into the object and
       leaves it where the Gaussians keep it deeper; the contact is where w = u, up to 10⁻⁵ of the deepest overlap (float32). Rim and skirt
-      are about those of a linear elastic layer that is bonded at its back and touches without friction (docs/rigid-pad.md).
+      are about those of a linear elastic layer that is bonded at its back and touches without friction (docs/concepts/rigid-pad.md).
     - ``"threshold"``: Taxim's own (Si & Yuan, RA-L 2022, III), ``PYRAMID_SIGMAS``, gains of 1, w = u⁺ on the full contact
       C = {u > 0.4 max u}, nothing elsewhere. It keeps every detail of a relief, tears the surface along the border of C on steep walls
       (dots in the image) and lets the gel reach into the object outside C.

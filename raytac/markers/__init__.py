@@ -1,4 +1,4 @@
-"""Markers: motion of the dots on the coat by four models; see docs/markers.md."""
+"""Markers: motion of the dots on the coat by five models; see docs/concepts/markers.md."""
 
 import lazy_loader
 

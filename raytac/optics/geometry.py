@@ -2,7 +2,7 @@
 
 The reference integrator traces the triangles of this surface. The fast one needs no acceleration structure for it: the surface is
 a height field over a regular grid, camera rays are near the grid's normal and shadow rays leave the thin slab of the imprint after
-a few cells. Rebuilding a bounding volume hierarchy each frame costs more than all of its rays (docs/optics.md has the measurement).
+a few cells. Rebuilding a bounding volume hierarchy each frame costs more than all of its rays (docs/measurements/image-modes.md).
 """
 
 from __future__ import annotations

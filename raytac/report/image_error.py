@@ -1,7 +1,7 @@
 """Error of an 8-bit image against a reference: MAE, RMSE, PSNR, SSIM and FLIP.
 
 Over the frame or a part of it. Images are RGB as the camera writes them: (H, W, 3), uint8, the gamma of the sensor's response in them.
-docs/comparison.md defines every figure once more in words.
+docs/concepts/image-error.md defines every figure once more in words.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The Franka Panda, ours or the menagerie's, with tactile sensors; sources: docs/robots.md."""
+"""The Franka Panda, ours or the menagerie's, with tactile sensors (docs/guide/robots.md)."""
 
 from __future__ import annotations
 

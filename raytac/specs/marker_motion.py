@@ -12,7 +12,7 @@ from raytac.specs.toml import Number, Schema, Text, check_fields, read_toml, spl
 
 @dataclass(frozen=True)
 class PunchSpec:
-    """Motion of the skin around a contact that sticks: a rigid punch (docs/markers.md)."""
+    """Motion of the skin around a contact that sticks: a rigid punch (docs/concepts/markers.md)."""
 
     anisotropy: float
     """κ: excess of following along the shear over across it [-]; ν / (2 − ν) on a half-space."""
@@ -117,7 +117,7 @@ def marker_motion_text(motion: MarkerMotionSpec) -> str:
 
 
 _NOTES = {
-    "dilate_gain_per_mm3": "integral form of the published sum; see docs/markers.md",
+    "dilate_gain_per_mm3": "integral form of the published sum; see docs/concepts/markers.md",
     "dilate_lambda_per_mm2": "lambda_d",
     "shear_lambda_per_mm2": "lambda_s",
     "shear_max_mm": "cap of the shear that markers follow",

@@ -176,7 +176,7 @@ class CSoftPads(SoftPads):
             depth[b] = max(depth[b], one.depth)
             if (one.body, one.geom) not in self._warned:
                 self._warned.add((one.body, one.geom))
-                rule = "bodies of the solver touch gels, fixed bodies and each other, and pass through cases and links (docs/worlds.md)"
+                rule = "the solver's bodies touch gels, fixed bodies and each other, and pass through cases and links: docs/guide/worlds.md"
                 where = f" in environment {b} at {self._datas[b].time:.3f} s"
                 warnings.warn(
                     f"{one.body!r} is {one.depth * 1e3:.3g} mm inside the robot's geom {one.geom!r}{where}: {rule}",

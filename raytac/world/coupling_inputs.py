@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 STIFFENING = 2.0
 """Stiffness assumed of a bonded soft body over that at rest.
 
-It stiffens as it is stretched, twisted or sheared (docs/coupling.md)."""
+It stiffens as it is stretched, twisted or sheared (docs/concepts/coupling.md)."""
 _NOTHING = int(NOTHING)
 
 

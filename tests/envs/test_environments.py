@@ -83,7 +83,7 @@ print(gymnasium.make_vec("raytac.envs:raytac/RollBall-v2", 2, "vector_entry_poin
 
 @pytest.mark.script
 def test_gymnasium_makes_it_without_an_import_of_ours() -> None:
-    """Only with the module before the colon: an entry point would be of no use since Gymnasium 1.0, as docs/rl.md says."""
+    """Only with the module before the colon: an entry point would be of no use since Gymnasium 1.0, as docs/guide/learning.md says."""
     run = subprocess.run([sys.executable, "-c", _BY_NAME], capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     lines = [line for line in run.stdout.splitlines() if line in ("needs an import", "RollBallEnv", "2")]

@@ -11,7 +11,7 @@ from experiments.bench_soft import STUDY, TOOLS, pressed
 from raytac.specs import load_sensor
 
 FINE = {"ball": 1.612, "cylinder": 3.898, "punch": 0.996}
-"""``soft.fine.force_n.*`` of ``experiments/bench_soft.py --forces`` (docs/soft-pad.md) [N]."""
+"""``soft.fine.force_n.*`` of ``experiments/bench_soft.py --forces`` (docs/measurements/soft-pad.md) [N]."""
 GELPAD = replace(load_sensor("gelsight_mini").gelpad, dome_radius=(math.inf, math.inf))
 
 

@@ -50,7 +50,7 @@ def test_shipped_policies_fit_their_tasks(path: Path) -> None:
 
 
 def test_a_policy_pushes_the_cube_on_rigid_pads_and_a_run_goes_on(tmp_path: Path) -> None:
-    """Success needs the right network: 251 of 256 in docs/rl.md."""
+    """Success needs the right network: 251 of 256 in docs/measurements/learning.md."""
     path = next(path for path in POLICIES if path.stem == "push_cube_ppo")
     args = soft_policies.Args(policies=str(path), episodes=4, num_envs=4, device="cpu", out=tmp_path)
     row = soft_policies.played(str(path), "rigid", args)

@@ -1,4 +1,4 @@
-"""The blocks of ``docs/own-model.md`` run one after the other, on the gripper of the example."""
+"""The blocks of ``docs/guide/own-model.md`` run one after the other, on the gripper of the example."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ ROOT = Path(__file__).parents[2]
 def test_the_blocks_of_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copy(ROOT / "examples" / "gripper.xml", tmp_path)
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "own-model.md").read_text(encoding="utf-8"), flags=re.S)
+    blocks = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / "guide" / "own-model.md").read_text(encoding="utf-8"), flags=re.S
+    )
     assert len(blocks) == 5
     names: dict[str, Any] = {}
     forces = []
     for block in blocks:
-        exec(compile(block, "docs/own-model.md", "exec"), names)
+        exec(compile(block, "docs/guide/own-model.md", "exec"), names)
         if "frame" in names:
             frame = names.pop("frame")
             forces.append(frame.force[:, 2])

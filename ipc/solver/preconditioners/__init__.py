@@ -24,7 +24,9 @@ _NEARLY_INCOMPRESSIBLE = 1 / (1 - 2 * 0.47)
 
 
 def pays(layout: Layout, settings: Settings, batch: int, device: wp.Device) -> bool:
-    """Expect the rest inverse to be faster than block-Jacobi (``docs/ipc-preconditioners.md``).
+    """Expect the rest inverse to be faster than block-Jacobi.
+
+    ``docs/concepts/preconditioners.md`` says when.
 
     On CUDA with a tight linear tolerance it does for pads of 700 free nodes or more, and for smaller ones in few environments. With a loose
     one it does for 700 to 3,000 free nodes, and for more from ν = 0.47 on, if no other body is free. On a CPU applying a dense inverse

@@ -10,7 +10,7 @@ Light that reaches the coat after at least one reflection comes from two places,
    V(p) = Σ_j B_j / π · max(0, cos θ_j) ΔA_j / r² · ω_j as a vector, so that a pixel's own normal gives E = max(0, n · V).
 
 Left out: occlusion between coat patches, second and later bounces within the coat, the change of the case's light with the imprint, and
-the shape of the specular lobe (indirect light meets the albedo (1 − s) ρ + s). docs/optics.md states the error that remains.
+the shape of the specular lobe (indirect light meets the albedo (1 − s) ρ + s). docs/concepts/optics.md states the error that remains.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ class _Environment:
 
 
 class RigidPad(PressPad):
-    """Press scene on a sensor with the rigid pad (see docs/rigid-pad.md).
+    """Press scene on a sensor with the rigid pad (see docs/concepts/rigid-pad.md).
 
     .. code-block:: python
 

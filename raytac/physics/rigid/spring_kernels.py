@@ -10,7 +10,7 @@ at least the work from the bodies that the gel stores (F is convex and K its gre
 c is the gel's relaxation time τ (Kelvin and Voigt) where the step resolves the motion, and goes to Δt where it does not: backward Euler.
 
 MuJoCo's constraint obeys R f = a* − a with a the acceleration that opens the contact, (v + Δt a) = −w: R = 1 / (C Δt),
-a* = F(δ) / (C Δt) − v / Δt (``row_kernels``, docs/worlds.md).
+a* = F(δ) / (C Δt) − v / Δt (``row_kernels``, docs/concepts/rigid-contact.md).
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false

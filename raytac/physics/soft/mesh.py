@@ -42,7 +42,7 @@ PAD_LEVELS = {
     "medium": PadLevel(0.85e-3, 5, 2.5, 2.5, 3e-5),
     "fine": PadLevel(0.5e-3, 8, 2.5, 3.0, 1.5e-5),
 }
-"""Named levels; docs/soft-pad.md has the height error of each."""
+"""Named levels; docs/measurements/soft-pad.md has the errors of each."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def pad_mesh(gelpad: GelpadSpec, level: str | PadLevel | PadMesh) -> PadMesh:
     """Mesh of a gelpad, or the mesh itself: six tetrahedra a cell of a grid on the dome.
 
     Cells are mirror images of their neighbours (``ipc.box_mesh``). If all were divided alike, nearly incompressible gel would lock
-    (docs/soft-pad.md has the figures).
+    (docs/measurements/soft-pad.md has figures).
 
     Args:
         gelpad: size, thickness, dome, and the faces bonded to the case: the back, or the back and the sides.

@@ -30,7 +30,7 @@ _SAG = 0.1
 
 
 class SoftPad(PressPad):
-    """Press scene on a sensor with a soft pad (see docs/soft-pad.md); used as ``RigidPad`` is.
+    """Press scene on a sensor with a soft pad (docs/concepts/soft-pad.md); used as ``RigidPad``.
 
     Between readings the solver takes as many steps as it needs. An ``indent`` to a depth ends when the *coat* is at that depth:
     the barrier's clearance is added to the object's height; on the way the coat is there within some micrometres, and never deeper than

@@ -74,7 +74,7 @@ class SoftScene:
             ignored: pairs of names that pass through each other.
             num_envs: B; None: as many as the poses have.
             device: ``cpu``, ``cuda`` or ``auto``.
-            settings: of the solver, instead of ``dt``, ``gravity`` and the tolerances of ``accuracy`` (see docs/soft-pad.md).
+            settings: of the solver, instead of ``dt``, ``gravity`` and the tolerances of ``accuracy`` (see docs/concepts/soft-pad.md).
             accuracy: tolerances of the solver, and its substeps.
 
         Raises:

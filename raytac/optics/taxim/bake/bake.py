@@ -2,8 +2,8 @@
 
 A real calibration presses a ball some fifty times and finds its outline by hand. Here the surface is known, so every pixel that a press
 moved is a sample: its slope, from the front step that the table mode itself uses, names the bin; its place and its difference from the
-image at rest are what the bin's polynomial is fitted to, for touched pixels and for those around them apart (docs/taxim-table.md, *Baked
-from the ray tracer*).
+image at rest are what the bin's polynomial is fitted to, for touched pixels and for those around them apart
+(docs/concepts/taxim-table.md, *Baked from the ray tracer*).
 """
 
 from __future__ import annotations

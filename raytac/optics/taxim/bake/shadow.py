@@ -31,7 +31,7 @@ _SHARE = 0.9
 """Share of the samples that must be shaded.
 
 A table does not know the place, and of many rays the darkest counts, so that a shadow which falls elsewhere does harm: with 0.7 balls
-off the centre lost 2 dB, with 0.9 no press lost more than 0.1 dB (docs/taxim-table.md)."""
+off the centre lost 2 dB, with 0.9 no press lost more than 0.1 dB."""
 _FEWEST = 3
 """Samples below which a value is not trusted."""
 
