@@ -115,8 +115,10 @@ def relink(text: str, page: str) -> str:
         path = posixpath.normpath(posixpath.join(posixpath.dirname(source_of(page)), name))
         if path in OUTSIDE:
             place = OUTSIDE[path]
-        elif path == "examples" or path.startswith("examples/"):
-            place, anchor = EXAMPLES, re.sub(r"[^\w-]", "", posixpath.basename(path)) if path != "examples" else ""
+        elif path in ("examples", "examples/README.md"):
+            place, anchor = EXAMPLES, ""
+        elif path.startswith("examples/"):
+            place, anchor = EXAMPLES, re.sub(r"[^\w-]", "", posixpath.basename(path))
         elif path.startswith("docs/"):
             place = path.removeprefix("docs/")
         else:
