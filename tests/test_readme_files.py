@@ -14,12 +14,11 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 FIRST_STEPS = (DOCS / "guide" / "first-steps.md").read_text(encoding="utf-8")
-PAGES = [
-    path
-    for path in (*sorted(ROOT.glob("*.md")), *(ROOT / folder / "README.md" for folder in ("scenes", "ipc", "examples")))
-    if path.exists()
-]
-PAGES += sorted(DOCS.rglob("*.md"))
+PAGES = (
+    sorted(ROOT.glob("*.md"))
+    + [ROOT / folder / "README.md" for folder in ("scenes", "ipc", "examples")]
+    + sorted(DOCS.rglob("*.md"))
+)
 SOURCES = [
     path
     for folder in ("raytac", "ipc", "scenes", "lights", "experiments", "examples", "tests")
