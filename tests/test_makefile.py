@@ -57,6 +57,14 @@ def test_a_changed_project_file_or_a_lost_stamp_installs_again(checkout: Path, t
 
 
 @needs_make
+def test_the_documents_install_their_builder_once(checkout: Path) -> None:
+    commands = planned(checkout, "docs")
+    assert "'.[docs]'" in commands and commands.index("docs/build/pages.py") < commands.index("zensical build --strict")
+    (checkout / ".venv" / ".installed-docs").touch()
+    assert "pip" not in planned(checkout, "docs")
+
+
+@needs_make
 def test_a_check_asks_for_the_types_of_what_changed_only(checkout: Path) -> None:
     (checkout / "raytac").mkdir()
     kept, changed = checkout / "raytac" / "kept.py", checkout / "raytac" / "changed.py"

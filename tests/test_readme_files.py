@@ -14,10 +14,11 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 FIRST_STEPS = (DOCS / "guide" / "first-steps.md").read_text(encoding="utf-8")
-PAGES = [
-    path for path in (*sorted(ROOT.glob("*.md")), *(ROOT / folder / "README.md" for folder in ("scenes", "ipc"))) if path.exists()
-]
-PAGES += sorted(DOCS.rglob("*.md"))
+PAGES = (
+    sorted(ROOT.glob("*.md"))
+    + [ROOT / folder / "README.md" for folder in ("scenes", "ipc", "examples")]
+    + sorted(DOCS.rglob("*.md"))
+)
 SOURCES = [
     path
     for folder in ("raytac", "ipc", "scenes", "lights", "experiments", "examples", "tests")
@@ -81,6 +82,11 @@ def test_pages_that_the_code_names_exist() -> None:
     }
     assert len(named) > 20
     assert sorted(f"{path}: {page}" for path, page in named if not (ROOT / page).exists()) == []
+
+
+def test_every_example_is_listed() -> None:
+    listed = set(LINK.findall((ROOT / "examples" / "README.md").read_text(encoding="utf-8")))
+    assert {path.name for path in (ROOT / "examples").glob("*.py")} <= listed, "list it in examples/README.md"
 
 
 def test_the_readme_is_one_page() -> None:

@@ -40,7 +40,7 @@ BULLET = re.compile(r"^│\s+• ([a-z][a-z-]*)(?:\s|│)", re.MULTILINE)
 
 def commands(*path: str) -> dict[str, str]:
     """Help text of the command ``path`` and of all below it, by its words."""
-    environment = {**os.environ, "COLUMNS": "110", "NO_COLOR": "1", "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
+    environment = {**os.environ, "COLUMNS": "88", "NO_COLOR": "1", "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
     call = [sys.executable, "-m", "raytac", *path, "--help"]
     text = subprocess.run(call, capture_output=True, text=True, check=True, env=environment, cwd=ROOT).stdout
     result = {" ".join(path): re.sub(r"\x1b\[[0-9;]*m", "", text).strip()}
@@ -115,8 +115,10 @@ def relink(text: str, page: str) -> str:
         path = posixpath.normpath(posixpath.join(posixpath.dirname(source_of(page)), name))
         if path in OUTSIDE:
             place = OUTSIDE[path]
-        elif path == "examples" or path.startswith("examples/"):
-            place, anchor = EXAMPLES, re.sub(r"[^\w-]", "", posixpath.basename(path)) if path != "examples" else ""
+        elif path in ("examples", "examples/README.md"):
+            place, anchor = EXAMPLES, ""
+        elif path.startswith("examples/"):
+            place, anchor = EXAMPLES, re.sub(r"[^\w-]", "", posixpath.basename(path))
         elif path.startswith("docs/"):
             place = path.removeprefix("docs/")
         else:
