@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import Annotated
 
@@ -21,6 +23,7 @@ from raytac.cli.press import PressArgs
 from raytac.cli.view import ViewArgs
 from raytac.errors import RaytacError
 from raytac.io.folder import DISK_ERRORS
+from raytac.io.progress import Progress
 
 __all__ = ["main"]
 
@@ -36,6 +39,15 @@ _Command = (
 _DESCRIPTION = "Simulate GelSight tactile sensors. `raytac --version` tells which raytac this is."
 
 
+class _StandardError(logging.Handler):
+    """Lines on standard error, above a bar of progress where there is one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if sys.stderr is not None:
+            level = "" if record.levelno <= logging.INFO else f"{record.levelname.lower()}: "
+            Progress.write(f"raytac: {level}{record.getMessage()}", file=sys.stderr)
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code.
 
@@ -45,6 +57,11 @@ def main(args: Sequence[str] | None = None) -> int:
     args = sys.argv[1:] if args is None else args
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # of paths that this locale cannot write, as standard error does
+    log, shown = logging.getLogger("raytac"), _StandardError(logging.INFO)
+    before, formatted = log.level, warnings.formatwarning
+    log.addHandler(shown)
+    log.setLevel(logging.INFO)
+    warnings.formatwarning = lambda message, *_, **__: f"raytac: warning: {message}\n"
     try:
         status = _run(args)
         if sys.stdout is not None:
@@ -65,6 +82,10 @@ def main(args: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("raytac: interrupted, nothing written", file=sys.stderr)
         return 130
+    finally:
+        log.removeHandler(shown)
+        log.setLevel(before)
+        warnings.formatwarning = formatted
 
 
 def _run(args: Sequence[str]) -> int:

@@ -178,25 +178,34 @@ class TactileSensor:
 
     def press(
         self,
-        scene: str | Path | PressScene | np.ndarray,
+        scene: Any,
         *,
         depth: float | None = None,
+        force: float | None = None,
+        offset: tuple[float, float] = (0.0, 0.0),
+        yaw: float = 0.0,
+        tilt: float = 0.0,
         scale: float | None = None,
         pitch: float | None = None,
+        repair: bool = False,
         progress: bool = False,
         **own: Unpack[EnvironmentTargets],
     ) -> TactileFrame:
         """Run the scene's trajectory; frame at its peak: the end of the last stage but a release.
 
-        A mesh file or an array of heights [m] is pressed in to ``depth`` [m]; ``scale`` [m per file unit] and ``pitch`` [m] as in
-        ``raytac.specs.press_of``. ``own``: settings by environment, as ``load`` takes them. ``progress``: a soft pad, which takes
-        seconds to minutes, shows its stages and the solver's steps in a bar on standard error, if that is a terminal.
+        A mesh (a file or a ``trimesh.Trimesh``) or an array of heights [m] is pressed in to ``depth`` [m] or with ``force`` [N]; a scene
+        that is given one of them is pressed once, so. ``offset`` [m], ``yaw`` and ``tilt`` [rad] place it; these, ``scale``, ``pitch`` and
+        ``repair`` are those of ``raytac.specs.press_of``, and the same in all environments. ``own``: settings by environment, as ``load``
+        takes them. ``progress``: a soft pad, which takes seconds to minutes, shows its stages and the solver's steps in a bar on standard
+        error, elsewhere as lines.
 
         Raises:
-            InputError: an argument of ``load`` of the wrong shape or out of range.
+            InputError: an argument of ``press_of``, or of ``load``, of the wrong kind or shape, or out of range.
             SpecError: the scene breaks a rule, alone or together with this sensor.
+            MeshError: the mesh cannot be used.
         """
-        press = press_of(scene, depth=depth, scale=scale, pitch=pitch)
+        placed = {"offset": offset, "yaw": yaw, "tilt": tilt}
+        press = press_of(scene, depth=depth, force=force, scale=scale, pitch=pitch, repair=repair, **placed)
         validate_press(self.spec, press)
         began = time.perf_counter()
         pad = self.load(press, **own)
