@@ -46,6 +46,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "test_cli.py",
         "test_doctor.py",
         "test_press_end_to_end.py",
+        "test_render.py",
         "view/test_view_command.py",
     ),
     "solver": (
@@ -83,6 +84,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "test_arguments.py",
         "test_device.py",
         "test_fuzz_inputs.py",
+        "test_render.py",
         "test_sensor.py",
         "test_sensor_soft.py",
         "test_threads.py",
