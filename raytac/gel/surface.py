@@ -119,13 +119,13 @@ class GelSurface:
         ``contact`` (B, Ny, Nx), bool; None takes Taxim's rule, the nodes pressed in by more than 0.4 of the deepest.
         """
         pressed = np.maximum(-displacement, 0.0)
-        if contact is None:
-            contact = pressed > CONTACT_SCALE * pressed.max(axis=(1, 2), keepdims=True)
-        weight = np.where(contact, pressed, 0.0)
+        deep = pressed > CONTACT_SCALE * pressed.max(axis=(1, 2), keepdims=True)
+        touched = deep if contact is None else contact
+        weight = np.where(touched, pressed, 0.0)
         total = weight.sum(axis=(1, 2))
         moments = np.stack([weight.sum(axis=1) @ grid.x, weight.sum(axis=2) @ grid.y], axis=1)
         centre = np.divide(moments, total[:, None], out=np.full((len(total), 2), np.nan), where=total[:, None] > 0.0)
-        return cls(grid, (grid.rest + displacement).astype(np.float32), contact, centre)
+        return cls(grid, (grid.rest + displacement).astype(np.float32), touched, centre)
 
     @property
     def batch(self) -> int:
