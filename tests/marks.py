@@ -21,6 +21,7 @@ import pytest
 PLACES: dict[str, tuple[str, ...]] = {
     "renderer": (
         "calibrate",
+        "dataset/test_command.py",
         "dataset/test_renderer.py",
         "envs/test_rsl_warp.py",
         "envs/test_warp_variation.py",
@@ -95,6 +96,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "world",
     ),
     "script": (
+        "dataset/test_command.py",
         "dataset/test_ray_cluster.py",
         "envs/test_rsl.py",
         "envs/test_sb3.py",
