@@ -21,6 +21,7 @@ import pytest
 PLACES: dict[str, tuple[str, ...]] = {
     "renderer": (
         "calibrate",
+        "dataset/test_command.py",
         "dataset/test_renderer.py",
         "envs/test_rsl_warp.py",
         "envs/test_warp_variation.py",
@@ -46,6 +47,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "test_cli.py",
         "test_doctor.py",
         "test_press_end_to_end.py",
+        "test_render.py",
         "view/test_view_command.py",
     ),
     "solver": (
@@ -83,6 +85,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "test_arguments.py",
         "test_device.py",
         "test_fuzz_inputs.py",
+        "test_render.py",
         "test_sensor.py",
         "test_sensor_soft.py",
         "test_threads.py",
@@ -93,6 +96,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "world",
     ),
     "script": (
+        "dataset/test_command.py",
         "dataset/test_ray_cluster.py",
         "envs/test_rsl.py",
         "envs/test_sb3.py",

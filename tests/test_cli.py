@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import sys
@@ -9,9 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 import raytac
-from raytac.cli import main
+from raytac.cli import COMMANDS, main
 from raytac.io.metrics import read_metrics
 
 TOUCH = """
@@ -106,6 +108,34 @@ def test_a_press_without_images_from_any_folder(tmp_path: Path) -> None:
     assert np.load(out / "height.npy").ndim == 2
     metrics = read_metrics(out / "metrics.json")
     assert metrics["mode"] == "rigid" and "time.optics_ms" not in metrics
+
+
+def test_the_overview_is_one_line_a_command_and_fits_a_screen(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 24 and max(map(len, lines)) <= 90
+    assert {line.split()[0] for line in lines if line.startswith("  ")} == set(COMMANDS)
+    for args, word in (([], "must be given"), (["pres"], "did you mean 'press'?")):
+        with pytest.raises(SystemExit):
+            main(args)
+        assert word in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_its_own_help(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([name, "--help"])
+    assert ended.value.code == 0 and f"usage: raytac {name} " in capsys.readouterr().out
+
+
+def test_messages_of_the_library_are_lines_on_standard_error(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    hollow = trimesh.creation.box((6.0, 4.0, 3.0))
+    hollow.update_faces(np.arange(12) > 0)
+    hollow.export(tmp_path / "open.stl")
+    command = ["press", str(tmp_path / "open.stl"), "--depth", "0.5", "--outputs", "height", "--out", str(tmp_path / "out")]
+    assert main([*command, "--repair"]) == 0
+    assert capsys.readouterr().err.startswith(f"raytac: warning: {tmp_path / 'open.stl'}: closed 1 hole")
+    assert not logging.getLogger("raytac").handlers
 
 
 def test_help_names_the_choices(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,38 +2,42 @@
 
 from __future__ import annotations
 
+import importlib
 import io
+import logging
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Sequence
-from typing import Annotated
-
-import tyro
 
 from raytac import __version__
-from raytac.cli.bake import BakeArgs
-from raytac.cli.calibrate import CalibrateArgs
-from raytac.cli.compare import CompareArgs
-from raytac.cli.compare_real import CompareRealArgs
-from raytac.cli.doctor import DoctorArgs
-from raytac.cli.press import PressArgs
-from raytac.cli.view import ViewArgs
-from raytac.errors import RaytacError
+from raytac.errors import InputError, RaytacError
 from raytac.io.folder import DISK_ERRORS
+from raytac.io.progress import Progress
 
 __all__ = ["main"]
 
-_Command = (
-    Annotated[PressArgs, tyro.conf.subcommand("press")]
-    | Annotated[BakeArgs, tyro.conf.subcommand("bake")]
-    | Annotated[CalibrateArgs, tyro.conf.subcommand("calibrate")]
-    | Annotated[CompareArgs, tyro.conf.subcommand("compare")]
-    | Annotated[CompareRealArgs, tyro.conf.subcommand("compare-real")]
-    | Annotated[ViewArgs, tyro.conf.subcommand("view")]
-    | Annotated[DoctorArgs, tyro.conf.subcommand("doctor")]
-)
-_DESCRIPTION = "Simulate GelSight tactile sensors. `raytac --version` tells which raytac this is."
+COMMANDS = {
+    "press": ("PressArgs", "press an object into the gel: image, height, forces, preview"),
+    "view": ("ViewArgs", "a scene in the browser, with sliders that press or steer"),
+    "dataset": ("DatasetArgs", "press objects many times: a data set of images and forces"),
+    "compare": ("CompareArgs", "error of the image modes beside their time, as a report"),
+    "bake": ("BakeArgs", "bake a Taxim table from the ray tracer of a sensor"),
+    "calibrate": ("CalibrateArgs", "fit a sensor to photographs, or its markers to the soft pad"),
+    "compare-real": ("CompareRealArgs", "fit to some photographs of presses and test on the others"),
+    "doctor": ("DoctorArgs", "try everything that the jobs need, and say how to mend it"),
+}
+"""Class of each command, in the module of its name, and its line in the overview."""
+
+
+class _StandardError(logging.Handler):
+    """Lines on standard error, above a bar of progress where there is one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if sys.stderr is not None:
+            level = "" if record.levelno <= logging.INFO else f"{record.levelname.lower()}: "
+            Progress.write(f"raytac: {level}{record.getMessage()}", file=sys.stderr)
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -45,6 +49,11 @@ def main(args: Sequence[str] | None = None) -> int:
     args = sys.argv[1:] if args is None else args
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # of paths that this locale cannot write, as standard error does
+    log, shown = logging.getLogger("raytac"), _StandardError(logging.INFO)
+    before, formatted = log.level, warnings.formatwarning
+    log.addHandler(shown)
+    log.setLevel(logging.INFO)
+    warnings.formatwarning = lambda message, *_, **__: f"raytac: warning: {message}\n"
     try:
         status = _run(args)
         if sys.stdout is not None:
@@ -65,14 +74,38 @@ def main(args: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("raytac: interrupted, nothing written", file=sys.stderr)
         return 130
+    finally:
+        log.removeHandler(shown)
+        log.setLevel(before)
+        warnings.formatwarning = formatted
 
 
 def _run(args: Sequence[str]) -> int:
     if list(args) == ["--version"]:
         print(f"raytac {__version__}")
         return 0
-    command = tyro.cli(_Command, prog="raytac", description=_DESCRIPTION, args=args)  # type: ignore[call-overload]
-    return command.run()
+    if not args or args[0] not in COMMANDS:
+        return _overview(args)
+    import tyro
+
+    module = importlib.import_module(f"raytac.cli.{args[0].replace('-', '_')}")
+    command = getattr(module, COMMANDS[args[0]][0])
+    return tyro.cli(command, prog=f"raytac {args[0]}", args=args[1:]).run()
+
+
+def _overview(args: Sequence[str]) -> int:
+    """One line a command; exits with code 2 unless help was asked for."""
+    lines = ["usage: raytac COMMAND [OPTIONS]", "", "Simulate GelSight tactile sensors.", ""]
+    lines += [f"  {name:<14}{text}" for name, (_, text) in COMMANDS.items()]
+    lines += ["", "raytac COMMAND --help lists its options; raytac --version tells which raytac this is."]
+    if args and args[0] in ("-h", "--help"):
+        print("\n".join(lines))
+        return 0
+    print("\n".join(lines), file=sys.stderr)
+    given = {"value": args[0]} if args else {}
+    error = InputError("command", rule="must be a known command" if args else "must be given", choices=COMMANDS, **given)
+    print(f"raytac: error: {error}", file=sys.stderr)
+    raise SystemExit(2)
 
 
 def _drop_output() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,11 +31,25 @@ class PressArgs(ShadowOptions, SolverOptions):
     """
 
     scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """Name of a shipped press, path of a scene file, or an STL, OBJ or PLY file with --depth."""
+    """Name of a shipped press, path of a scene file, or a mesh: STL, OBJ, PLY, OFF, GLB."""
     depth: float | None = None
-    """Depth that a mesh file is pressed in to [mm]; scenes have their own."""
+    """Depth that the object is pressed in to [mm]; a mesh needs it or --force.
+
+    A scene is then pressed once, to this depth, in place of its own trajectory."""
+    force: float | None = None
+    """Normal force that the object is pressed with [N], in place of --depth."""
+    x: float = 0.0
+    """Displacement of the object to the right in the image [mm]."""
+    y: float = 0.0
+    """Displacement of the object downwards in the image [mm]."""
+    yaw: float = 0.0
+    """Turn of the object about the pad's normal [degrees], clockwise in the image."""
+    tilt: float = 0.0
+    """Turn about the image's horizontal axis before that [degrees]: the upper side goes deeper."""
     scale: float | None = None
-    """Metres per unit of a mesh file; 0.001, a file in millimetres, if not given."""
+    """Metres per unit of a mesh file; if not given 0.001 (millimetres), of GLB 1."""
+    repair: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Close the holes of a mesh, and say which; without it, an open mesh is an error."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
     physics: Annotated[str | None, named(PHYSICS.names)] = None
@@ -73,7 +88,16 @@ class PressArgs(ShadowOptions, SolverOptions):
         outputs = every if self.outputs is None else parse_outputs(self.outputs, OUTPUTS)
         # Linear R, G, B of frame.exr is the sum of the layers, so an image asks for them too.
         computed = (*outputs, "layers") if "rgb" in outputs and "layers" in every else outputs
-        scene = press_of(self.scene, depth=None if self.depth is None else self.depth / 1e3, scale=self.scale)
+        scene = press_of(
+            self.scene,
+            depth=None if self.depth is None else self.depth / 1e3,
+            force=self.force,
+            offset=(self.x / 1e3, self.y / 1e3),
+            yaw=math.radians(self.yaw),
+            tilt=math.radians(self.tilt),
+            scale=self.scale,
+            repair=self.repair,
+        )
         physics = chosen_physics(self.physics, self.level, scene)
         self.prepare_warp()
         sensor = TactileSensor(

@@ -295,6 +295,8 @@ def _object_of(scene: PressScene) -> dict[str, Any]:
     spec = scene.object
     if spec.heights:
         params = {**params, "sha256": hashlib.sha256(repr(spec.heights).encode()).hexdigest()}
+    if spec.triangles is not None:
+        params = {**params, "sha256": spec.triangles.digest}
     return {
         "kind": spec.kind,
         "params": params,

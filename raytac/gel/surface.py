@@ -13,6 +13,8 @@ from numpy.typing import ArrayLike
 from raytac.checks import check_kind, check_number
 from raytac.errors import InputError
 from raytac.gel.coat_mesh import DeformedCoat
+from raytac.gel.gaussian import CONTACT_SCALE
+from raytac.gel.interpolate import sampled
 from raytac.specs.sensor import GelpadSpec
 
 
@@ -110,6 +112,21 @@ class GelSurface:
         height = grid.rest[None].astype(np.float32)
         return cls(grid, height, np.zeros(height.shape, bool), np.full((1, 2), np.nan))
 
+    @classmethod
+    def displaced(cls, grid: PadGrid, displacement: np.ndarray, contact: np.ndarray | None = None) -> GelSurface:
+        """Surfaces moved by ``displacement`` [m], (B, Ny, Nx), along z; <= 0 is pressed in.
+
+        ``contact`` (B, Ny, Nx), bool; None takes Taxim's rule, the nodes pressed in by more than 0.4 of the deepest.
+        """
+        pressed = np.maximum(-displacement, 0.0)
+        deep = pressed > CONTACT_SCALE * pressed.max(axis=(1, 2), keepdims=True)
+        touched = deep if contact is None else contact
+        weight = np.where(touched, pressed, 0.0)
+        total = weight.sum(axis=(1, 2))
+        moments = np.stack([weight.sum(axis=1) @ grid.x, weight.sum(axis=2) @ grid.y], axis=1)
+        centre = np.divide(moments, total[:, None], out=np.full((len(total), 2), np.nan), where=total[:, None] > 0.0)
+        return cls(grid, (grid.rest + displacement).astype(np.float32), touched, centre)
+
     @property
     def batch(self) -> int:
         return self.height.shape[0]
@@ -126,6 +143,17 @@ class GelSurface:
     def indentation(self) -> np.ndarray:
         """Depth rest − height [m], (B, Ny, Nx); negative where the gel bulges outwards."""
         return self.grid.rest[None] - self.height
+
+
+def on_grid(grid: PadGrid, values: np.ndarray, pitch: tuple[float, float]) -> np.ndarray:
+    """Maps (B, rows, columns) as the camera sees them, at the nodes of a grid (B, Ny, Nx).
+
+    The middle of a map is over the pad's centre, its columns and rows are ``pitch`` (x, y) [m] apart. Between them it is bilinear; beyond
+    the edges the value at the edge is taken.
+    """
+    y, x = (step * (np.arange(n) - 0.5 * (n - 1)) for n, step in zip(values.shape[1:], pitch[::-1], strict=True))
+    at_x, at_y = (nodes.ravel() for nodes in np.meshgrid(grid.x, grid.y))
+    return sampled(values, x, y, at_x, at_y).reshape(len(values), *grid.shape)
 
 
 def rounded_envs(envs: list[int], batch: int) -> list[int]:

@@ -1,15 +1,17 @@
-"""Progress of long work: a bar on a terminal, elsewhere a line every few seconds."""
+"""Progress of long work: a bar on a terminal or in a notebook, elsewhere a line now and then."""
 
 from __future__ import annotations
 
 import sys
 from typing import Any
 
-from tqdm import tqdm
+from tqdm.auto import tqdm
+
+_IN_NOTEBOOK = any(base.__module__ == "tqdm.notebook" for base in tqdm.__mro__)
 
 
 class Progress(tqdm):
-    """A ``tqdm`` bar that writes plain lines into a log, a file or a pipe."""
+    """A ``tqdm`` bar, of widgets in a notebook; plain lines into a log, a file or a pipe."""
 
     def __init__(
         self, iterable: Any = None, *, desc: str, show: bool = True, interval: float = 5.0, file: Any = None, **options: Any
@@ -24,10 +26,12 @@ class Progress(tqdm):
             options: of ``tqdm``: ``total``, ``unit``, ``initial``, ``leave``, ….
         """
         stream = sys.stderr if file is None else file
-        self._as_lines = not (hasattr(stream, "isatty") and stream.isatty())
+        is_terminal = hasattr(stream, "isatty") and stream.isatty()
+        self._as_lines = not is_terminal and not (_IN_NOTEBOOK and file is None)
         self._interval, self._written = interval, 0
         if self._as_lines:
             options |= {"mininterval": interval, "miniters": 0, "delay": interval, "leave": False}
+            options |= {"display": False} if _IN_NOTEBOOK else {}
         super().__init__(iterable, desc, file=stream, disable=not show or stream is None, **options)
 
     def refresh(self, *args: Any, **keywords: Any) -> None:
@@ -43,9 +47,9 @@ class Progress(tqdm):
             self._write_line()
         super().close()
 
-    def display(self, msg: str | None = None, pos: int | None = None) -> bool:
+    def display(self, *args: Any, **keywords: Any) -> bool:
         """Draw the bar; lines are written by ``refresh`` alone."""
-        return False if self._as_lines else bool(super().display(msg, pos))
+        return False if self._as_lines else bool(super().display(*args, **keywords))
 
     def clear(self, *args: Any, **keywords: Any) -> None:
         """Remove the bar before other text is written; lines stay."""

@@ -34,13 +34,15 @@ def object_parts(spec: Shape) -> tuple[Part, ...]:
     origin, base of the given radius at ``height`` above it. ``torus``: axis z, lying flat. ``pins``: a plate with rows × columns
     (y × x) of flat-ended pins, ``pin_height`` long, under its face z = 0. ``plane``: the half-space under z = 0 (task scenes
     only). ``coin``: face down, field at z = 0. ``mesh``: as its file has it. ``mjcf``: every geom of one body, body frame.
-    ``heights``: a relief under z = 0, centred. Curved parts are exact shapes, not facets. Raises ``SpecError`` for an unknown
-    kind, a missing or impossible length, or a model that MuJoCo refuses or that has no such body.
+    ``heights``: a relief under z = 0, centred. ``triangles``: as they are. Curved parts are exact shapes, not facets. Raises
+    ``SpecError`` for an unknown kind, a missing or impossible length, or a model that MuJoCo refuses or that has no such body.
     """
     if spec.kind == "plane":
         return (primitive("plane"),)
     if isinstance(spec, ObjectSpec) and spec.heights:
         return (_heights(spec),)
+    if isinstance(spec, ObjectSpec) and spec.triangles is not None:
+        return (mesh_part(spec.triangles.vertices, spec.triangles.faces),)
     if spec.kind not in OBJECT_SCHEMA:
         raise SpecError("must be a known kind of object", key="object.kind", value=spec.kind, choices=tuple(OBJECT_SCHEMA))
     if spec.kind == "none":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -32,6 +33,8 @@ from raytac.specs.press import PADS
 
 SHOWN = 3
 """Presses on the image sheet: in true colour, with their noise, more make a large file."""
+
+_LOG = logging.getLogger("raytac")
 
 
 @dataclass(frozen=True)
@@ -210,7 +213,7 @@ def compare_real(
         metrics |= grain_metrics(measured_grain(sensor, steady), level)
         metrics["outliers"] = ", ".join(bad)
         for name, reason in bad.items():
-            print(f"press {name} is an outlier: {reason}")
+            _LOG.info("press %s is an outlier: %s", name, reason)
         head: dict[str, Metric] = {
             "command": "compare-real",
             "device": device,

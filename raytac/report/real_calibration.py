@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import logging
 import time
 from pathlib import Path
 
@@ -44,6 +45,8 @@ FILES = (
     "drift.csv",
     "metrics.json",
 )
+
+_LOG = logging.getLogger("raytac")
 
 
 def run_calibrate_optics(
@@ -162,7 +165,7 @@ def run_calibrate_optics(
         bad = outliers([names[k] for k in index[~is_test]], fitted_errors, fitted.state.circles, train)
         metrics["outliers"] = ", ".join(bad)
         for name, reason in bad.items():
-            print(f"press {name} is an outlier: {reason}")
+            _LOG.info("press %s is an outlier: %s", name, reason)
         metrics |= drift_metrics(drifts, models.settled.background, float(models.rest.mean()))
         grain = measured_grain(sensor, models.settled)
         metrics |= grain_metrics(grain, float(models.rest.mean()))

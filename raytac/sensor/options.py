@@ -7,7 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
-from raytac.checks import check_names, check_whole
+import numpy as np
+from numpy.typing import ArrayLike
+
+from raytac.checks import check_names, check_number, check_numbers, check_whole
 from raytac.errors import InputError
 from raytac.frame import OUTPUTS
 from raytac.io.options import parse_resolution
@@ -87,6 +90,30 @@ def checked_resolution(resolution: tuple[int, int] | str | None) -> tuple[int, i
     for side in resolution:
         check_whole("resolution", side, 1, LARGEST_SIDE)
     return int(resolution[0]), int(resolution[1])
+
+
+def check_maps(name: str, values: ArrayLike, shape: tuple[int, ...] | None = None) -> np.ndarray:
+    """Maps (B, rows, columns), float64, of one or several; ``InputError`` for anything else.
+
+    ``shape``: that of other maps, whose mask this is.
+    """
+    given = np.asarray(values)
+    if shape is not None and given.dtype.kind == "b":
+        given = given.astype(float)
+    given = given[None] if given.ndim == 2 else given
+    if given.dtype.kind in "iuf" and (given.ndim != 3 or min(given.shape) < 1 or min(given.shape[1:]) < 2):
+        rule = "must have shape (rows, columns) or (B, rows, columns), with 2 rows and columns at least"
+        raise InputError(name, value=np.shape(values), rule=rule)
+    return check_numbers(name, given, shape or (None, None, None), finite=True)
+
+
+def checked_pitch(pitch: float | tuple[float, float]) -> tuple[float, float]:
+    """Spacing (x, y) [m] of a map. Raises ``InputError`` for what is not one or two lengths."""
+    pair = tuple(pitch) if isinstance(pitch, (tuple, list)) else (pitch, pitch)
+    if len(pair) != 2:
+        raise InputError("pitch", value=pitch, rule="must be one length or two, (x, y), in metres")
+    x, y = (check_number("pitch", one, "(0, 0.01]", "m") for one in pair)
+    return x, y
 
 
 def press_scene(scene: str | Path | PressScene) -> PressScene:

@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any, Unpack
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from raytac.checks import MOST_ENVIRONMENTS, check_seed, check_seeds, check_truth, check_whole
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.frame import IMAGES, TactileFrame
-from raytac.gel.surface import GelSurface, PadGrid, check_grid, chosen_envs, grid_pitch, make_grid
+from raytac.gel.pyramid import ElasticSurround
+from raytac.gel.surface import GelSurface, PadGrid, check_grid, chosen_envs, grid_pitch, make_grid, on_grid
 from raytac.gel.traction import cell_areas
 from raytac.markers.base import MarkersConfig
 from raytac.markers.pattern import MarkerPattern, dot_ink
@@ -29,8 +31,10 @@ from raytac.physics.registry import PHYSICS, checked_physics, scene_physics
 from raytac.physics.soft.contact_width import cells_across, holds_force, warn_if_narrow
 from raytac.sensor.options import (
     EnvironmentTargets,
+    check_maps,
     checked_markers,
     checked_outputs,
+    checked_pitch,
     checked_resolution,
     press_scene,
     warn_of_other_shape,
@@ -178,25 +182,34 @@ class TactileSensor:
 
     def press(
         self,
-        scene: str | Path | PressScene | np.ndarray,
+        scene: Any,
         *,
         depth: float | None = None,
+        force: float | None = None,
+        offset: tuple[float, float] = (0.0, 0.0),
+        yaw: float = 0.0,
+        tilt: float = 0.0,
         scale: float | None = None,
         pitch: float | None = None,
+        repair: bool = False,
         progress: bool = False,
         **own: Unpack[EnvironmentTargets],
     ) -> TactileFrame:
         """Run the scene's trajectory; frame at its peak: the end of the last stage but a release.
 
-        A mesh file or an array of heights [m] is pressed in to ``depth`` [m]; ``scale`` [m per file unit] and ``pitch`` [m] as in
-        ``raytac.specs.press_of``. ``own``: settings by environment, as ``load`` takes them. ``progress``: a soft pad, which takes
-        seconds to minutes, shows its stages and the solver's steps in a bar on standard error, if that is a terminal.
+        A mesh (a file or a ``trimesh.Trimesh``) or an array of heights [m] is pressed in to ``depth`` [m] or with ``force`` [N]; a scene
+        that is given one of them is pressed once, so. ``offset`` [m], ``yaw`` and ``tilt`` [rad] place it; these, ``scale``, ``pitch`` and
+        ``repair`` are those of ``raytac.specs.press_of``, and the same in all environments. ``own``: settings by environment, as ``load``
+        takes them. ``progress``: a soft pad, which takes seconds to minutes, shows its stages and the solver's steps in a bar on standard
+        error, elsewhere as lines.
 
         Raises:
-            InputError: an argument of ``load`` of the wrong shape or out of range.
+            InputError: an argument of ``press_of``, or of ``load``, of the wrong kind or shape, or out of range.
             SpecError: the scene breaks a rule, alone or together with this sensor.
+            MeshError: the mesh cannot be used.
         """
-        press = press_of(scene, depth=depth, scale=scale, pitch=pitch)
+        placed = {"offset": offset, "yaw": yaw, "tilt": tilt}
+        press = press_of(scene, depth=depth, force=force, scale=scale, pitch=pitch, repair=repair, **placed)
         validate_press(self.spec, press)
         began = time.perf_counter()
         pad = self.load(press, **own)
@@ -339,6 +352,55 @@ class TactileSensor:
             fields["images"] = partial(_by_name, images, None if grain is None else partial(self._with_grain, seeds=grain))
             time_ms["optics"] = 1e3 * (time.perf_counter() - done)
         return TactileFrame(surface, time_ms=time_ms, label=self.label, **fields)  # a mode is named once it is built
+
+    def render(
+        self,
+        heights: ArrayLike,
+        pitch: float | tuple[float, float] | None = None,
+        *,
+        overlap: bool = False,
+        contact: ArrayLike | None = None,
+    ) -> TactileFrame:
+        """Frame of a height map that something else computed, without a press.
+
+        Args:
+            heights: displacement of the gel's surface from its rest along z of the pad frame [m]: 0 untouched, negative where it is
+                pressed in, shape (rows, columns), or (B, rows, columns) for B frames. As the camera sees it: row 0 at the top, column 0
+                on the left; the middle over the pad's centre. Beyond its edges the value at the edge is taken.
+            pitch: spacing of the columns and rows on the pad [m], one number or (x, y); None: the map covers the camera's view.
+            overlap: True if the map holds the undeformed object where it lies below the resting gel, as a depth camera in a simulator
+                of rigid bodies sees it and as Taxim's geometric overlap does; 0 elsewhere. The gel around it then follows as under the
+                rigid pad. False takes the map as the gel itself.
+            contact: mask of the map's shape, where the object touches; None is 0.4 of the greatest depth, as in Taxim. A table asks
+                for it, a ray tracer does not. Not with ``overlap``, which knows it.
+
+        Raises ``InputError``: a map of another kind or shape, that is not finite, or deeper than the gel is thick.
+        """
+        frame = self.update(self._mapped(heights, pitch, overlap=check_truth("overlap", overlap), contact=contact))
+        _, plus, optics = frame.label.partition("+")
+        return frame.with_values(label=("overlap" if overlap else "map") + plus + optics)
+
+    def _mapped(
+        self, heights: ArrayLike, pitch: float | tuple[float, float] | None, *, overlap: bool, contact: ArrayLike | None
+    ) -> GelSurface:
+        """Surface of ``render``."""
+        given = check_maps("heights", heights)
+        step = self.spec.camera.pitch_at(given.shape[:0:-1]) if pitch is None else checked_pitch(pitch)
+        thickness = self.spec.gelpad.thickness
+        if np.abs(given).max() >= thickness or (overlap and given.max() > 0.0):
+            rule = f"must be displacements in metres, within the gel's thickness of {thickness:g} m" + overlap * ", and <= 0"
+            raise InputError("heights", value=(float(given.min()), float(given.max())), rule=rule)
+        moved = on_grid(self.grid, given, step)
+        if not overlap:
+            mask = None if contact is None else on_grid(self.grid, check_maps("contact", contact, given.shape), step) >= 0.5
+            return GelSurface.displaced(self.grid, moved, mask)
+        if contact is not None:
+            raise InputError("contact", rule="is computed with overlap=True: leave it out")
+        surround = ElasticSurround(self.grid, thickness=thickness)
+        surface = surround.surface(np.where(moved < 0.0, self.grid.rest + moved, np.inf))
+        if not np.isfinite(surface.height).all():
+            raise InputError("heights", value=float(given.min()), rule="would press the gel below its bonded face")
+        return surface
 
     def rest(self, envs: Sequence[int] = (0,)) -> TactileFrame:
         """Frame of untouched pads, which difference images start from; markers keep history.

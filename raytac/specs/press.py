@@ -9,6 +9,7 @@ from typing import Final
 
 from raytac.checks import is_number
 from raytac.errors import SpecError
+from raytac.specs.mesh import TriangleMesh
 from raytac.specs.sensor import Vec3
 from raytac.specs.shape_file import OBJECT_SCHEMA, check_params, check_quaternion
 from raytac.specs.toml import Number, Schema, Text, check_fields
@@ -37,8 +38,8 @@ POSE_SCHEMA: Final[Schema] = {
 }
 """Keys of ``[object]`` that every kind but ``none`` has."""
 
-OBJECT_KINDS: Final[dict[str, Schema]] = {**OBJECT_SCHEMA, "heights": {"pitch_mm": Number("(0, 10]")}}
-"""Parameter keys by kind of object: kinds of scene files, and ``heights``, made in code."""
+OBJECT_KINDS: Final[dict[str, Schema]] = {**OBJECT_SCHEMA, "heights": {"pitch_mm": Number("(0, 10]")}, "triangles": {}}
+"""Parameter keys by kind of object; ``heights`` and ``triangles`` are made in code only."""
 
 _DURATION = {"duration_s": Number("(0, 60]", default=0.5)}
 STAGE_SCHEMA: Final[dict[str, Schema]] = {
@@ -56,7 +57,7 @@ class ObjectSpec:
 
     Most kinds are exact shapes: sphere, cylinder, edge, cone, torus and pins are computed from a few lengths, so that no facet
     shows in an image; a coin is an elevation map made in code; ``mesh`` reads triangles from a file, ``mjcf`` the geoms of a body;
-    ``heights`` is an elevation map of the user's.
+    ``heights`` is an elevation map of the user's, ``triangles`` a mesh in memory.
     """
 
     kind: str
@@ -79,6 +80,8 @@ class ObjectSpec:
     """Of a soft object."""
     heights: tuple[tuple[float, ...], ...] = field(default=(), repr=False)
     """Elevation [m] of a ``heights`` object: rows along y, columns along x; 0 is no object."""
+    triangles: TriangleMesh | None = field(default=None, repr=False)
+    """Surface of a ``triangles`` object."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.kind, str) or self.kind not in OBJECT_KINDS:
@@ -90,6 +93,9 @@ class ObjectSpec:
             raise SpecError('must be given for the kind "heights", and for no other', key="object.heights", value=len(rows))
         if not all(is_number(value) and 0.0 <= value < math.inf for row in rows for value in row):
             raise SpecError("must be finite numbers >= 0 [m]", key="object.heights", value=f"{len(rows)} rows")
+        if not (isinstance(self.triangles, TriangleMesh) if self.kind == "triangles" else self.triangles is None):
+            rule = 'must be a TriangleMesh for the kind "triangles", and None for every other'
+            raise SpecError(rule, key="object.triangles", value=type(self.triangles).__name__)
         if self.kind == "none":
             return
         check_params(self.kind, self.params, OBJECT_KINDS[self.kind], "object")

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from raytac.checks import check_number, check_numbers
+from raytac.checks import check_number, check_numbers, check_truth
 from raytac.errors import InputError, SpecError
+from raytac.se3 import quaternion, rotation_of
 from raytac.specs.files import find_file, name_of
-from raytac.specs.mesh import MESH_SUFFIXES, load_mesh
+from raytac.specs.mesh import FILE_SCALE, MESH_SUFFIXES, TriangleMesh, closed_mesh, load_mesh
 from raytac.specs.press import POSE_SCHEMA, SCENE_SCHEMA, STAGE_SCHEMA, ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.shape_file import OBJECT_SCHEMA, check_shape, unit_quaternion, warn_of_crossings
 from raytac.specs.toml import Table, Text, in_mm, read_toml
 
 _KIND = "kind"
+_UNTURNED = (1.0, 0.0, 0.0, 0.0)
 
 
 def load_press(name_or_path: str | Path) -> PressScene:
@@ -54,61 +59,121 @@ def load_press(name_or_path: str | Path) -> PressScene:
 
 
 def press_of(
-    source: str | Path | PressScene | np.ndarray,
+    source: Any,
     *,
     depth: float | None = None,
+    force: float | None = None,
+    offset: tuple[float, float] = (0.0, 0.0),
+    yaw: float = 0.0,
+    tilt: float = 0.0,
     scale: float | None = None,
     pitch: float | None = None,
+    repair: bool = False,
 ) -> PressScene:
     """Press scene of whatever can be pressed: a scene, a mesh or a height map.
 
-    A mesh or a height map is pressed straight down by its −z side. The middle of its bounding box is over the centre of the pad.
+    A mesh or a height map is pressed straight down by its −z side, with the middle of its bounding box over the centre of the pad.
+    There the object's frame has its origin.
 
     Args:
-        source: a scene, or its name or file (``load_press``); an STL, OBJ or PLY file (``load_mesh``); or the heights [m] of a face,
-            shape (rows, columns), as the camera sees it. The greatest height touches first, and where it is 0 there is no object.
-        depth: how deep a mesh or a height map is pressed in [m].
-        scale: metres per unit of a mesh file; None is 0.001, a file in millimetres.
+        source: a scene, or its name or file (``load_press``); an STL, OBJ, PLY, OFF or GLB file (``load_mesh``); a ``trimesh.Trimesh``;
+            or the heights [m] of a face, shape (rows, columns), as the camera sees it. The greatest height touches first, and where it
+            is 0 there is no object.
+        depth: how deep it is pressed in [m]; of a scene, one press to this depth in place of its trajectory.
+        force: normal force that it is pressed with [N], likewise. A mesh or a height map needs one of the two.
+        offset: displacement of the object along x and y, pad frame [m].
+        yaw: turn about the pad frame's z and the object's origin [rad], clockwise in the image.
+        tilt: turn about the pad frame's x before that [rad]; the object leans towards the side that is up in the image.
+        scale: metres per unit of a mesh; None is 0.001, a file in millimetres, but 1 for GLB, which is in metres, and for a mesh in memory.
         pitch: spacing of the rows and columns of a height map [m].
+        repair: close the holes of a mesh, as ``load_mesh`` does.
 
     Raises:
-        InputError: an argument that is missing, or that belongs to another kind of source; heights that are not finite, negative, or all 0.
-        SpecError: a depth out of range; as ``load_press``.
+        InputError: an argument that is missing, out of range, or that belongs to another kind of source; heights that are not finite,
+            negative, or all 0.
+        SpecError: a depth or force out of range; as ``load_press``.
         MeshError: as ``load_mesh``.
     """
-    if not isinstance(source, (str, Path, PressScene, np.ndarray)):
-        rule = f"must be a name, a path, a PressScene or an array of heights, not {type(source).__name__}"
-        raise InputError("scene", value=source, rule=rule)
+    place = check_numbers("offset", offset, (2,), finite=True)
+    turn = _turned(check_number("yaw", yaw, "[-7, 7]", "rad"), check_number("tilt", tilt, "[-1.6, 1.6]", "rad"))
+    is_file = isinstance(source, (str, Path)) and Path(source).suffix.lower() in MESH_SUFFIXES
+    is_mesh = is_file or (hasattr(source, "vertices") and hasattr(source, "faces"))
     is_map = isinstance(source, np.ndarray)
-    is_mesh = isinstance(source, (str, Path)) and Path(source).suffix.lower() in MESH_SUFFIXES
+    if not is_mesh and not is_map and not isinstance(source, (str, Path, PressScene)):
+        rule = f"must be a name, a path, a PressScene, a trimesh.Trimesh or an array of heights, not {type(source).__name__}"
+        raise InputError("scene", value=source, rule=rule)
     for name, value, owner, belongs in (
-        ("depth", depth, "a mesh or a height map", is_mesh or is_map),
         ("scale", scale, "a mesh", is_mesh),
+        ("repair", check_truth("repair", repair) or None, "a mesh", is_mesh),
         ("pitch", pitch, "a height map", is_map),
     ):
         if value is not None and not belongs:
             raise InputError(name, value=value, rule=f"belongs to {owner}: leave it out with a {'mesh' if is_mesh else 'scene'}")
-        if value is None and belongs and name != "scale":
-            units = ", in metres (on the command line in millimetres)" if name == "depth" else ", in metres"
-            raise InputError(name, rule=f"must be given with {owner}{units}")
-    if isinstance(source, PressScene):
-        return source
-    if isinstance(source, np.ndarray):
-        heights = check_numbers("heights", source, (None, None), finite=True)
-        if not heights.size or heights.min() < 0 or heights.max() == 0:
-            raise InputError("heights", value=heights.shape, rule="must be >= 0 everywhere and > 0 somewhere [m]")
-        params: dict[str, float | int | str] = {"pitch": check_number("pitch", pitch, "(0, 0.01]", "m")}
-        rows = tuple(map(tuple, heights.tolist()))
-        target = ObjectSpec("heights", params, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.1, heights=rows)
-        return PressScene("heights", target, (StageSpec("indent", depth=depth),))
-    if not is_mesh:
-        return load_press(source)
-    path, scale = Path(source).absolute(), check_number("scale", 0.001 if scale is None else scale, "(0, 10]", "m per file unit")
-    vertices, faces = load_mesh(path, scale)
-    warn_of_crossings(str(path), vertices, faces)
-    x, y, _ = (-0.5 * (vertices.min(axis=0) + vertices.max(axis=0))).tolist()
-    target = ObjectSpec("mesh", {"path": str(path), "scale": scale}, (x, y, 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)
-    return PressScene(name_of(path), target, (StageSpec("indent", depth=depth),))
+    if depth is not None and force is not None:
+        raise InputError("depth, force", value=(depth, force), rule="cannot both be given: a press ends at one of them")
+    if depth is None and force is None and (is_mesh or is_map):
+        rule = "must be given with a mesh or a height map, in metres (on the command line in millimetres), or force in newtons"
+        raise InputError("depth", rule=rule)
+    if is_mesh:
+        scene = _mesh_scene(source, scale, repair=bool(repair))
+    elif isinstance(source, np.ndarray):
+        scene = PressScene("heights", _heights_object(source, pitch), ())
+    else:
+        scene = source if isinstance(source, PressScene) else load_press(source)
+    given = {
+        "depth": depth,
+        "force": force,
+        "offset": place.tolist() if place.any() else None,
+        "yaw": yaw or None,
+        "tilt": tilt or None,
+    }
+    for name, value in given.items():
+        if value is not None and scene.object.kind == "none":
+            raise InputError(name, value=value, rule=f"needs an object, and the scene {scene.name!r} has none")
+    if depth is not None and scene.object.dynamics == "affine":
+        raise InputError(
+            "depth", value=depth, rule="is not for a free body (affine), which is laid on the pad by its weight: give force"
+        )
+    if depth is not None or force is not None:
+        scene = replace(scene, trajectory=(StageSpec("indent", depth=depth, force=force),))
+    if not place.any() and turn == _UNTURNED:
+        return scene
+    (x, y, z), own = scene.object.position, rotation_of(scene.object.quaternion)
+    w, i, j, k = quaternion(rotation_of(turn) @ own).tolist()
+    target = replace(scene.object, position=(x + float(place[0]), y + float(place[1]), z), quaternion=(w, i, j, k))
+    return replace(scene, object=target)
+
+
+def _turned(yaw: float, tilt: float) -> tuple[float, float, float, float]:
+    """Quaternion wxyz of a turn about x by ``tilt``, then about z by ``yaw`` [rad]."""
+    (c, s), (a, b) = ((math.cos(0.5 * angle), math.sin(0.5 * angle)) for angle in (yaw, tilt))
+    return c * a, c * b, s * b, s * a
+
+
+def _mesh_scene(source: Any, scale: float | None, *, repair: bool) -> PressScene:
+    """A mesh without a trajectory, its origin in the middle of its bounding box."""
+    is_file = isinstance(source, (str, Path))
+    path = Path(source).absolute() if is_file else None
+    usual = 1.0 if path is None else FILE_SCALE.get(path.suffix.lower(), 0.001)
+    scale = check_number("scale", usual if scale is None else scale, "(0, 10]", "m per file unit")
+    if path is not None:
+        vertices, faces = load_mesh(path, scale, repair=repair)
+    else:
+        vertices, faces = closed_mesh(source.vertices, source.faces, scale, repair=repair)
+    warn_of_crossings("in memory" if path is None else str(path), vertices, faces)
+    vertices = vertices - 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    target = ObjectSpec("triangles", {}, (0.0, 0.0, 0.0), _UNTURNED, 0.1, triangles=TriangleMesh(vertices, faces))
+    return PressScene("mesh" if path is None else name_of(path), target, ())
+
+
+def _heights_object(source: np.ndarray, pitch: float | None) -> ObjectSpec:
+    if pitch is None:
+        raise InputError("pitch", rule="must be given with a height map, in metres")
+    heights = check_numbers("heights", source, (None, None), finite=True)
+    if not heights.size or heights.min() < 0 or heights.max() == 0:
+        raise InputError("heights", value=heights.shape, rule="must be >= 0 everywhere and > 0 somewhere [m]")
+    params: dict[str, float | int | str] = {"pitch": check_number("pitch", pitch, "(0, 0.01]", "m")}
+    return ObjectSpec("heights", params, (0.0, 0.0, 0.0), _UNTURNED, 0.1, heights=tuple(map(tuple, heights.tolist())))
 
 
 def validate_press(sensor: SensorSpec, scene: PressScene) -> None:
@@ -119,8 +184,6 @@ def validate_press(sensor: SensorSpec, scene: PressScene) -> None:
     pad = sensor.gelpad
     half = (pad.size[0] / 2, pad.size[1] / 2)
     x, y, _ = scene.object.position
-    if scene.object.kind == "mesh" and scene.source is None:
-        x = y = 0.0  # its file's origin may lie anywhere; ``press_of`` puts its middle over the pad
     if scene.object.kind != "none" and (abs(x) > half[0] or abs(y) > half[1]):
         rule = f"the object must start on the pad of {sensor.name}: |x| <= {half[0] * 1e3:.4g} mm, |y| <= {half[1] * 1e3:.4g} mm"
         raise SpecError(rule, file=scene.source, key="object.position_mm", value=[x * 1e3, y * 1e3])

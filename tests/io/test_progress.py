@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import io
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import tqdm.std
 
 from raytac.io.progress import Progress
+
+ROOT = Path(__file__).parents[2]
 
 
 class Clock:
@@ -81,3 +86,43 @@ def test_none_is_shown_if_none_is_wanted(clock: Clock) -> None:
     for _ in Progress(range(60), desc="bake", show=False, file=log):
         clock.now += 1.0
     assert log.getvalue() == ""
+
+
+NOTEBOOK = """
+import io, sys, types
+
+class Widget:
+    shown = []
+    def __init__(self, children=(), **options):
+        self.value, self.children, self.layout = 0, children, types.SimpleNamespace(width="")
+        self.style, self.bar_style, self.max = types.SimpleNamespace(), "", 100
+
+class Box(Widget):
+    pass
+
+ipython, shell, widgets = (types.ModuleType(name) for name in ("IPython", "IPython.display", "ipywidgets"))
+ipython.get_ipython, ipython.display, shell.display = object, shell, Widget.shown.append
+widgets.HTML = widgets.FloatProgress = Widget
+widgets.HBox, widgets.__version__ = Box, "8.1"
+sys.modules |= {"IPython": ipython, "IPython.display": shell, "ipywidgets": widgets}
+sys.modules["ipykernel.zmqshell"] = types.ModuleType("ipykernel.zmqshell")
+
+from raytac.io import Progress
+
+for _ in Progress(range(3), desc="bake"):
+    pass
+(bar,) = Widget.shown
+assert bar.children[1].value == 3 and bar.children[1].bar_style == "success", vars(bar.children[1])
+log = io.StringIO()
+for _ in Progress(range(3), desc="bake", file=log, interval=0.0):
+    pass
+for _ in Progress(range(3), desc="bake", show=False):
+    pass
+assert len(Widget.shown) == 1 and "bake 3/3 it" in log.getvalue(), log.getvalue()
+"""
+
+
+def test_a_notebook_gets_a_bar_of_widgets_and_a_log_its_lines() -> None:
+    """Stand-ins for IPython and ipywidgets: tqdm decides by them where it runs."""
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", NOTEBOOK], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -110,7 +110,9 @@ def test_missing_and_unknown_format(tmp_path: Path) -> None:
         load_mesh(tmp_path / "gone.stl", 0.001)
     with pytest.raises(MeshError, match="the mesh file does not exist"):
         load_mesh(tmp_path / f"{'n' * 400}.stl", 0.001)
-    with pytest.raises(MeshError, match=r"cube\.step: suffix = '\.step': unknown mesh format.*choose from: \.stl, \.obj, \.ply"):
+    with pytest.raises(
+        MeshError, match=r"cube\.step: suffix = '\.step': unknown mesh format.*choose from: \.stl, \.obj, \.ply, \.off, \.glb"
+    ):
         load_mesh(tmp_path / "cube.step", 0.001)
 
 
@@ -178,3 +180,81 @@ def test_vertices_that_cannot_be_told_apart_are_refused(tmp_path: Path) -> None:
     box.export(tmp_path / "a.ply")
     with pytest.raises(MeshError, match="within 1e"):
         load_mesh(tmp_path / "a.ply", 1e-3)
+
+
+@pytest.mark.parametrize("suffix", [".off", ".glb"])
+def test_other_formats_agree_too(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"cube{suffix}"
+    CUBE.export(path)
+    vertices, faces = load_mesh(path, 0.001)
+    assert (vertices.shape, faces.shape) == ((8, 3), (12, 3))
+    np.testing.assert_allclose(vertices.max(axis=0), [5e-3, 4e-3, 3e-3], rtol=1e-6)
+
+
+def test_a_scene_of_several_placed_meshes_is_one_object(tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    scene.add_geometry(CUBE)
+    scene.add_geometry(CUBE, transform=trimesh.transformations.translation_matrix((20.0, 0.0, 0.0)))
+    scene.export(tmp_path / "two.glb")
+    vertices, faces = load_mesh(tmp_path / "two.glb", 0.001)
+    assert len(faces) == 24 and np.ptp(vertices[:, 0]) == pytest.approx(30e-3)
+
+
+def test_an_open_mesh_names_the_repair(tmp_path: Path) -> None:
+    assert "raytac press FILE --repair (in Python repair=True) closes holes" in refused(
+        tmp_path / "open.stl", stl(CUBE.triangles[1:])
+    )
+
+
+LID = np.flatnonzero(CUBE.face_normals[:, 2] > 0.5).tolist()
+
+
+@pytest.mark.parametrize("missing", [[0], LID, [0, 5, 9], [2, 3, 7]], ids=str)
+def test_holes_are_closed_and_named(tmp_path: Path, missing: list[int], caplog: pytest.LogCaptureFixture) -> None:
+    """Holes of a box in its planes: the closed box has the volume and the size of the whole one."""
+    path = tmp_path / "open.stl"
+    path.write_bytes(stl(np.delete(CUBE.triangles, missing, axis=0)))
+    with pytest.raises(MeshError, match="watertight"):
+        load_mesh(path, 0.001)
+    mesh = trimesh.Trimesh(*load_mesh(path, 0.001, repair=True), process=False)
+    assert mesh.is_watertight and mesh.is_winding_consistent
+    assert mesh.bounds == pytest.approx(1e-3 * CUBE.bounds)
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert line.startswith(f"{path}: closed ") and " mm (" in line and "edges)" in line
+    if missing in ([0], LID):
+        assert mesh.volume == pytest.approx(480e-9) and "closed 1 hole, width " in line
+
+
+def test_an_open_pipe_gets_two_lids(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    pipe = trimesh.creation.cylinder(radius=4.0, height=6.0, sections=64)
+    pipe.update_faces(np.abs(pipe.face_normals[:, 2]) < 0.5)
+    pipe.export(tmp_path / "pipe.ply")
+    mesh = trimesh.Trimesh(*load_mesh(tmp_path / "pipe.ply", 0.001, repair=True), process=False)
+    whole = trimesh.creation.cylinder(radius=4.0, height=6.0, sections=64)
+    assert mesh.is_watertight and mesh.volume == pytest.approx(1e-9 * whole.volume, rel=1e-6)
+    assert "closed 2 holes, width 8 mm (64 edges), 8 mm (64 edges)" in caplog.text
+
+
+def test_a_mesh_inside_out_is_turned_and_a_sound_one_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "cube.stl"
+    path.write_bytes(stl(CUBE.triangles[:, ::-1]))
+    assert trimesh.Trimesh(*load_mesh(path, 0.001, repair=True), process=False).volume == pytest.approx(480e-9)
+    assert "turned its faces" in caplog.text
+    caplog.clear()
+    path.write_bytes(stl(CUBE.triangles))
+    for kept, repaired in zip(load_mesh(path, 0.001), load_mesh(path, 0.001, repair=True), strict=True):
+        np.testing.assert_array_equal(kept, repaired)
+    assert not caplog.records
+
+
+def test_what_cannot_be_closed_is_refused(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    triangles = np.array(CUBE.triangles)
+    triangles[3] = triangles[3, ::-1]
+    (tmp_path / "mixed.stl").write_bytes(stl(triangles))
+    with pytest.raises(MeshError, match=r"edges with two faces on one side.*cannot be repaired: faces overlap, or are oriented"):
+        load_mesh(tmp_path / "mixed.stl", 0.001, repair=True)
+    fin = np.concatenate([CUBE.triangles, [[[-5.0, -4.0, -3.0], [5.0, -4.0, -3.0], [0.0, -9.0, 0.0]]]])  # a third face on an edge
+    (tmp_path / "fin.stl").write_bytes(stl(fin))
+    with pytest.raises(MeshError, match="cannot be repaired"):
+        load_mesh(tmp_path / "fin.stl", 0.001, repair=True)
+    assert not caplog.records

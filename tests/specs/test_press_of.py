@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ def block_map() -> np.ndarray:
 
 def test_a_mesh_is_pressed_straight_down_with_its_middle_over_the_pad(part: Path, sensor: TactileSensor) -> None:
     scene = press_of(part, depth=DEPTH)
-    assert (scene.name, scene.object.kind, scene.object.params["scale"]) == ("part", "mesh", 0.001)
+    assert (scene.name, scene.object.kind, scene.object.position) == ("part", "triangles", (0.0, 0.0, 0.0))
     assert scene.trajectory == (StageSpec("indent", depth=DEPTH),)
     frame = sensor.press(str(part), depth=DEPTH, scale=0.001)
     box = ObjectSpec("box", {"length": 6e-3, "width": 4e-3, "height": 3e-3}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)
@@ -90,7 +91,14 @@ def test_height_maps_differ_by_their_heights() -> None:
 @pytest.mark.parametrize(
     ("source", "settings", "message"),
     [
-        ("coin", {"depth": DEPTH}, "depth = 0.0008: belongs to a mesh or a height map"),
+        ("none", {"depth": DEPTH}, "depth = 0.0008: needs an object, and the scene 'none' has none"),
+        ("none", {"yaw": 0.1}, "yaw = 0.1: needs an object"),
+        ("coin", {"depth": DEPTH, "force": 2.0}, "depth, force = .*: cannot both be given"),
+        ("coin", {"repair": True}, "repair = True: belongs to a mesh"),
+        ("coin", {"repair": "yes"}, "repair = 'yes': must be True or False"),
+        ("coin", {"offset": 1e-3}, r"offset = 0.001: must have shape \(2,\), and is one number"),
+        ("coin", {"yaw": "left"}, r"yaw = 'left': must be a number in \[-7, 7\] rad"),
+        ("coin", {"tilt": 3}, r"tilt = 3: must be a number in \[-1.6, 1.6\] rad"),
         ("coin", {"scale": 0.001}, "scale = 0.001: belongs to a mesh: leave it out with a scene"),
         ("part.stl", {}, "depth: must be given with a mesh or a height map"),
         ("part.stl", {"depth": DEPTH, "pitch": 1e-4}, "pitch = 0.0001: belongs to a height map"),
@@ -101,7 +109,7 @@ def test_height_maps_differ_by_their_heights() -> None:
         (np.zeros((0, 5)), {"depth": DEPTH, "pitch": 1e-4}, "must be >= 0 everywhere"),
         (np.full((5, 5), np.nan), {"depth": DEPTH, "pitch": 1e-4}, "must be finite everywhere"),
         (np.zeros(5), {"depth": DEPTH, "pitch": 1e-4}, r"must have shape \(any, any\)"),
-        (3, {}, "must be a name, a path, a PressScene or an array of heights, not int"),
+        (3, {}, "must be a name, a path, a PressScene, a trimesh.Trimesh or an array of heights, not int"),
     ],
 )
 def test_arguments_that_do_not_belong_together_are_refused(source: object, settings: dict[str, float], message: str) -> None:
@@ -146,5 +154,73 @@ def test_the_command_takes_a_mesh_and_a_depth_in_millimetres(
     capsys.readouterr()
     assert main([*command, "--out", str(tmp_path / "none")]) == 2
     assert "depth: must be given with a mesh" in capsys.readouterr().err and not (tmp_path / "none").exists()
-    assert main(["press", "coin", "--depth", "0.8", "--out", str(tmp_path / "none")]) == 2
-    assert "depth = 0.0008: belongs to a mesh or a height map: leave it out with a scene" in capsys.readouterr().err
+    assert main(["press", "coin", "--scale", "0.1", "--out", str(tmp_path / "none")]) == 2
+    assert "scale = 0.1: belongs to a mesh: leave it out with a scene" in capsys.readouterr().err
+
+
+def test_the_command_places_and_repairs_a_mesh(tmp_path: Path, part: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    hollow = trimesh.load_mesh(part)
+    hollow.update_faces(np.arange(len(hollow.faces)) > 0)
+    hollow.export(tmp_path / "open.stl")
+    command = ["press", str(tmp_path / "open.stl"), "--force", "2", "--x", "1.5", "--y", "-1", "--outputs", "wrench"]
+    command += ["--device", "cpu", "--out", str(tmp_path / "out")]
+    assert main(command) == 2
+    assert "open.stl: the mesh must be watertight" in capsys.readouterr().err and not (tmp_path / "out").exists()
+    assert main([*command, "--repair", "--yaw", "90"]) == 0
+    assert "open.stl: closed 1 hole, width 4 mm (3 edges)" in capsys.readouterr().err
+    metrics = read_metrics(tmp_path / "out" / "metrics.json")
+    assert metrics["contact.force_z_n"] == pytest.approx(-2.0, rel=0.01)
+    assert (metrics["contact.centre_x_mm"], metrics["contact.centre_y_mm"]) == pytest.approx((1.5, -1.0), abs=0.15)
+
+
+def test_a_mesh_in_memory_is_pressed_as_its_file(part: Path, sensor: TactileSensor) -> None:
+    """In memory metres are the default, as everywhere in Python."""
+    block = trimesh.load_mesh(part)
+    by_file = sensor.press(part, force=2.0)
+    np.testing.assert_array_equal(sensor.press(block, force=2.0, scale=0.001).surface.height, by_file.surface.height)
+    block.apply_scale(1e-3)
+    np.testing.assert_allclose(sensor.press(block, force=2.0).surface.height, by_file.surface.height, atol=1e-8)
+    assert by_file.force[0, 2] == pytest.approx(-2.0, rel=1e-3)
+    assert press_of(block, depth=DEPTH) == press_of(block.copy(), depth=DEPTH)
+    assert press_of(block, depth=DEPTH) != press_of(trimesh.creation.box((6e-3, 4e-3, 2e-3)), depth=DEPTH)
+
+
+def test_plain_numbers_place_the_object(sensor: TactileSensor) -> None:
+    """A block of 6 × 4 mm, turned by 90°, is 4 × 6 mm; a tilted one touches first with the side that is up in the image."""
+    block = trimesh.creation.box((6e-3, 4e-3, 3e-3))
+    x, y = sensor.grid.x, sensor.grid.y
+
+    def sides(**place: Any) -> tuple[float, float, float, float]:
+        contact = sensor.press(block, depth=0.3e-3, **place).surface.contact[0]
+        across, down = x[contact.any(axis=0)], y[contact.any(axis=1)]
+        return across[0], across[-1], down[0], down[-1]
+
+    assert sides() == pytest.approx((-3e-3, 3e-3, -2e-3, 2e-3), abs=1.1e-4)
+    assert sides(offset=(1e-3, -0.5e-3)) == pytest.approx((-2e-3, 4e-3, -2.5e-3, 1.5e-3), abs=1.1e-4)
+    assert sides(yaw=np.pi / 2) == pytest.approx((-2e-3, 2e-3, -3e-3, 3e-3), abs=1.1e-4)
+    angle = np.radians(15)
+    edge = 2e-3 * np.cos(angle) - 1.5e-3 * np.sin(angle)
+    """Distance of the edge that leads from the middle."""
+    _, _, top, bottom = sides(tilt=angle)
+    assert top == pytest.approx(-edge, abs=1.1e-4) and bottom < 0.0
+    first, last, _, _ = sides(tilt=angle, yaw=np.pi / 2)  # that edge is turned clockwise, to the right
+    assert last == pytest.approx(edge, abs=1.1e-4) and first > 0.0
+
+
+def test_yaw_turns_clockwise_in_the_image(sensor: TactileSensor) -> None:
+    heights = np.zeros((41, 41))
+    heights[18:23, 33:38] = 1e-3  # 1.5 mm right of the middle
+    x, y = sensor.press(heights, depth=0.3e-3, pitch=0.1e-3, yaw=np.pi / 2).surface.contact_centre[0]
+    assert (x, y) == pytest.approx((0.0, 1.5e-3), abs=0.1e-3)
+
+
+def test_a_scene_takes_one_press_in_place_of_its_trajectory(sensor: TactileSensor) -> None:
+    scene = press_of("sphere", force=1.5, offset=(2e-3, 0.0))
+    assert scene.trajectory == (StageSpec("indent", force=1.5),) and scene.object.params == load_press("sphere").object.params
+    frame = sensor.press("sphere", force=1.5, offset=(2e-3, 0.0))
+    assert frame.force[0, 2] == pytest.approx(-1.5, rel=1e-3)
+    assert frame.surface.contact_centre[0] == pytest.approx((2e-3, 0.0), abs=5e-5)
+    with pytest.raises(InputError, match=r"is not for a free body \(affine\)"):
+        press_of(dataclasses.replace(scene, object=dataclasses.replace(scene.object, dynamics="affine")), depth=DEPTH)
+    with pytest.raises(SpecError, match="the object must start on the pad"):
+        sensor.press("sphere", offset=(50e-3, 0.0))

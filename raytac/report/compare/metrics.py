@@ -160,6 +160,7 @@ def compare_metrics(comparison: Comparison) -> dict[str, Metric]:
         "command": "compare",
         "sensor": settings.sensor,
         "scenes": ",".join(settings.scenes),
+        "scenes_pending": len(comparison.pending),
         "resolutions": ",".join(f"{w}x{h}" for w, h in settings.resolutions),
         "device": comparison.device,
         "seed": settings.seed,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from raytac.errors import BackendError
+from raytac.errors import BackendError, InputError
 from raytac.gel.surface import GelSurface
 from raytac.optics.base import Variant
 from raytac.optics.registry import OPTICS
@@ -83,6 +83,17 @@ def comparison_modes(spp: Sequence[int] = (1, 4, 16, 64), *, quick: bool = False
             for n in spp if variant.config.sampled else (None,):
                 modes.append(_mode(variant, n, left_out=quick and variant.slow))
     return (*modes, _peer("peer", shadow=False, left_out=quick), _peer("peer_shadow", shadow=True, left_out=quick))
+
+
+def chosen_modes(modes: Sequence[Mode], names: Sequence[str] | None) -> tuple[Mode, ...]:
+    """Modes of these names or families; None is all. Raises ``InputError`` for an unknown name."""
+    if names is None:
+        return tuple(modes)
+    families = tuple(dict.fromkeys(mode.family for mode in modes))
+    for name in names:
+        if name not in families and name not in [mode.name for mode in modes]:
+            raise InputError("modes", value=name, rule="must be known modes joined by commas, or all", choices=families)
+    return tuple(mode for mode in modes if mode.family in names or mode.name in names)
 
 
 def _too_slow(setting: Setting) -> OpticalMode:

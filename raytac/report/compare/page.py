@@ -72,7 +72,7 @@ def report_html(comparison: Comparison, pareto: Path, sheets: list[tuple[str, st
     flip = any(row.figures["frame_flip"] is not None for row in rows)
     figures = [row.figures for row in rows]
     noise = list({(f["scene"], f["resolution"]): f for f in figures if f["noise_frame_rmse"] is not None}.values())
-    scenes = ", ".join(Path(scene).stem for scene in settings.scenes)
+    scenes = ", ".join(dict.fromkeys(scene for scene, _ in comparison.references))
     return environment.get_template(TEMPLATE).render(
         sensor=rows[0].figures["sensor"] if rows else settings.sensor,
         device=comparison.device,
@@ -87,6 +87,7 @@ def report_html(comparison: Comparison, pareto: Path, sheets: list[tuple[str, st
         ],
         batch=next((s.batch for s in summary), 0),
         settings=settings,
+        pending=comparison.pending,
         has_flip=has_flip(),
         flip_ppd=f"{FLIP_PPD:.2f}",
         ring_mm=f"{1e3 * RING_WIDTH:g}",

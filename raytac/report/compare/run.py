@@ -1,16 +1,17 @@
 """``raytac compare``: every optical mode on the same gel surfaces, error beside time.
 
-Rows (scene x resolution x mode) are measured one after another and kept in ``out/rows``, converged references in ``out/references``:
+Rows (scene x resolution x mode) are measured scene after scene and kept in ``out/rows``, converged references in ``out/references``:
 the same command run again goes on where it stopped.
 """
 
 from __future__ import annotations
 
 import hashlib
+import logging
 import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,22 +24,24 @@ from raytac.gel.surface import GelSurface
 from raytac.io.code_digest import code_digest
 from raytac.io.metrics import Metric, versions
 from raytac.io.progress import Progress
+from raytac.optics.trace.config import RayTraced
 from raytac.report.compare.marker_error import PAD as MARKER_PAD
 from raytac.report.compare.marker_error import MarkerErrors, marker_errors
-from raytac.report.compare.modes import Mode, Setting, comparison_modes
+from raytac.report.compare.modes import Mode, Setting, chosen_modes, comparison_modes
 from raytac.report.compare.physics_error import PhysicsError, physics_errors
-from raytac.report.compare.settings import CompareSettings
+from raytac.report.compare.settings import CompareSettings, expected_seconds
 from raytac.report.compare.store import References, Row, RowStore, Value, row_key
 from raytac.report.image_error import METRICS, has_flip, image_errors, psnr, rmse
 from raytac.report.image_error import mae as mean_absolute
-from raytac.report.measure import machine, moving, timed_within
+from raytac.report.measure import machine, moving, once, timed_within
 from raytac.report.press import press_peaks
-from raytac.report.tracers import Tracers
+from raytac.report.tracers import Tracers, path_trace
 from raytac.specs import load_sensor
 
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode
 
+LOG = logging.getLogger("raytac")
 REGIONS = ("frame", "contact", "ring", "box")
 """Parts of an image that errors are taken of, by ``raytac.report.image_error.regions``."""
 BATCH = {"cpu": 8, "cuda": 64}
@@ -80,15 +83,23 @@ class Comparison:
     """Rigid pad against the soft one, if that was asked for."""
     markers: MarkerErrors | None = None
     """Marker models against surface tracking, if that was asked for."""
+    pending: tuple[str, ...] = ()
+    """Scenes that are not measured yet, as ``coin, 320x240``; empty at the end."""
 
 
-def run_comparison(settings: CompareSettings, out: Path, modes: Sequence[Mode] | None = None) -> Comparison:
+def run_comparison(
+    settings: CompareSettings,
+    out: Path,
+    modes: Sequence[Mode] | None = None,
+    report: Callable[[Comparison], object] | None = None,
+) -> Comparison:
     """Measure every row that ``out`` does not hold yet, and return all.
 
     Args:
         settings: what to compare; checked first.
         out: folder of ``rows`` and ``references``, made if need be.
-        modes: those of ``comparison_modes`` if None.
+        modes: those that the settings name if None.
+        report: called after each scene but the last with all that is known so far.
 
     Raises:
         RaytacError: as ``CompareSettings.check``; ``out`` is a file; or the ray tracer does not run on the device.
@@ -99,21 +110,22 @@ def run_comparison(settings: CompareSettings, out: Path, modes: Sequence[Mode] |
     from raytac.optics.runtime import load_mitsuba
 
     device = load_mitsuba(settings.device)[1]
-    modes = comparison_modes(settings.spp, quick=settings.quick) if modes is None else modes
-    facts = machine()
-    run = _Run(settings, device, RowStore(out / "rows", Progress.write), out / "references", facts)
-    total = len(settings.resolutions) * len(settings.scenes) * len(modes)
-    with Progress(total=total, desc="compare", unit="row") as bar:
-        for size in settings.resolutions:
-            run.measure_all(size, modes, bar)
+    if modes is None:
+        modes = chosen_modes(comparison_modes(settings.spp, quick=settings.quick), settings.modes)
+    run = _Run(settings, device, RowStore(out / "rows", Progress.write), out / "references", machine())
+    scenes = [(size, Path(scene).stem) for size in settings.resolutions for scene in settings.scenes]
+    with Progress(total=len(scenes) * len(modes), desc="compare", unit="row") as bar:
+        for k, (size, scene) in enumerate(scenes):
+            if size != run.size:
+                run.begin(size, modes, bar)
+            run.measure(scene, modes, bar)
+            if report is not None and k + 1 < len(scenes):
+                report(run.comparison(tuple(f"{name}, {w}x{h}" for (w, h), name in scenes[k + 1 :])))
         markers = None
         if settings.markers:
             bar.set_postfix_str("markers on the soft pad")
             markers = _marker_errors(settings, device)
-    known = versions()
-    known |= {key: value for key, value in versions(DISTRIBUTIONS).items() if key not in known}
-    rows, left_out, physics = tuple(run.rows), tuple(run.left_out), tuple(run.physics)
-    return Comparison(settings, device, rows, run.images, left_out, run.measured, facts | known, physics, markers)
+    return run.comparison(markers=markers)
 
 
 def _marker_errors(settings: CompareSettings, device: str) -> MarkerErrors:
@@ -134,59 +146,98 @@ class _Run:
     ) -> None:
         self.settings, self.device, self.store, self.folder = settings, device, store, references
         self.batch = settings.batch or BATCH[device]
+        known = versions()
+        self._facts = facts | known | {key: value for key, value in versions(DISTRIBUTIONS).items() if key not in known}
         self.machine = {key: value for key, value in facts.items() if key != "machine.load_at_start"}
         self.rows: list[Row] = []
         self.images: dict[tuple[str, str], np.ndarray] = {}
         self.left_out: list[LeftOut] = []
         self.physics: list[PhysicsError] = []
         self.measured = 0
+        self.size: tuple[int, int] = (0, 0)
+        """(width, height) that is measured now [px]."""
         self._digests: dict[tuple[str, ...], str] = {}
 
-    def measure_all(self, size: tuple[int, int], modes: Sequence[Mode], bar: Progress) -> None:
-        settings, name = self.settings, f"{size[0]}x{size[1]}"
-        spec, surfaces = press_peaks(settings.sensor, settings.scenes, size, settings.seed)
-        tracers = Tracers(spec, self.device, settings.seed)
-        references = References(self.folder, tracers, size, settings.reference_spp, Progress.write)
-        scenes = []
-        for scene, surface in surfaces.items():
-            bar.set_postfix_str(f"{name} {scene}: reference")
-            scenes.append(_Scene(scene, surface, references, tracers, size))
-            self.images[scene, name] = scenes[-1].truth
-        if settings.pad is not None:
-            bar.set_postfix_str(f"{name}: soft pad")
-            self.physics += physics_errors(tracers, settings.scenes, size, settings.pad, surfaces)
-        seen: set[str] = set()
-        for mode in modes:
-            done = len(self.rows)
-            try:
-                self._measure_mode(mode, Setting(tracers, size), scenes, mode.family not in seen, bar)
-            except RaytacError as error:
-                self.left_out.append(LeftOut(name, mode.name, mode.label, str(error)))
-                bar.update(len(scenes) - (len(self.rows) - done))
-            seen.add(mode.family)
+    def comparison(self, pending: tuple[str, ...] = (), markers: MarkerErrors | None = None) -> Comparison:
+        """All that is measured so far."""
+        rows, left_out, physics = tuple(self.rows), tuple(self.left_out), tuple(self.physics)
+        images = dict(self.images)
+        return Comparison(
+            self.settings, self.device, rows, images, left_out, self.measured, self._facts, physics, markers, pending
+        )
 
-    def _measure_mode(self, mode: Mode, setting: Setting, scenes: list[_Scene], first: bool, bar: Progress) -> None:
-        """Rows of one mode; ``first`` says that no mode before has built and compiled the same."""
-        name = f"{setting.size[0]}x{setting.size[1]}"
-        built: OpticalMode | None = None
-        first_image_s: float | None = None
-        for scene in scenes:
-            bar.set_postfix_str(f"{name} {scene.name}: {mode.label}")
-            key, file = self._key(mode, scene), f"{scene.name}-{name}-{mode.name}"
-            row = self.store.read(file, key)
-            if row is None:
-                if built is None:
-                    if mode.prepare is not None:
-                        mode.prepare(setting)
-                    start = time.perf_counter()
-                    built = mode.build(setting)
-                    _rgb(built, scene.surface)
-                    first_image_s = time.perf_counter() - start if first else None
-                row = self._measure(mode, built, scene, name, setting.tracers.spec.name, first_image_s)
-                self.store.write(file, key, row)
-                self.measured += 1
-            self.rows.append(row)
+    def begin(self, size: tuple[int, int], modes: Sequence[Mode], bar: Progress) -> None:
+        """Press every scene for images of ``size``, and tell how long the comparison will take."""
+        settings, first = self.settings, self.size == (0, 0)
+        self.size = size
+        bar.set_postfix_str(f"{self._name}: presses")
+        spec, self._surfaces = press_peaks(settings.sensor, settings.scenes, size, settings.seed)
+        self._tracers = Tracers(spec, self.device, settings.seed)
+        self._references = References(self.folder, self._tracers, size, settings.reference_spp, Progress.write)
+        self._built: dict[str, tuple[OpticalMode, float | None]] = {}
+        self._families: set[str] = set()
+        self._failed: set[str] = set()
+        if first:
+            bar.set_postfix_str("estimate of the time")
+            surface = next(iter(self._surfaces.values()))
+            tracer = self._tracers.get(size, RayTraced("reference"))
+            path_trace(tracer, surface, 1, 0)  # compiles
+            sample_s = 1e-3 * once(lambda seed: path_trace(tracer, surface, 4, seed), 1) / 4
+            seconds = expected_seconds(settings, modes, sample_s)
+            LOG.info(
+                "about %s for %d scenes and %d modes, if nothing is kept from before; %s/report.html grows after each scene",
+                Progress.format_interval(seconds),
+                len(settings.scenes) * len(settings.resolutions),
+                len(modes),
+                self.folder.parent,
+            )
+
+    @property
+    def _name(self) -> str:
+        return f"{self.size[0]}x{self.size[1]}"
+
+    def measure(self, name: str, modes: Sequence[Mode], bar: Progress) -> None:
+        """Rows of one scene, by every mode."""
+        settings, size = self.settings, self._name
+        bar.set_postfix_str(f"{size} {name}: reference")
+        scene = _Scene(name, self._surfaces[name], self._references, self._tracers, self.size)
+        self.images[name, size] = scene.truth
+        if settings.pad is not None:
+            bar.set_postfix_str(f"{size} {name}: soft pad")
+            press = next(one for one in settings.scenes if Path(one).stem == name)
+            self.physics += physics_errors(self._tracers, (press,), self.size, settings.pad, self._surfaces)
+        for mode in modes:
+            if mode.name not in self._failed:
+                bar.set_postfix_str(f"{size} {name}: {mode.label}")
+                try:
+                    self._measure_mode(mode, scene)
+                except RaytacError as error:
+                    self._failed.add(mode.name)
+                    self.left_out.append(LeftOut(size, mode.name, mode.label, str(error)))
+            self._families.add(mode.family)
             bar.update()
+
+    def _measure_mode(self, mode: Mode, scene: _Scene) -> None:
+        key, file = self._key(mode, scene), f"{scene.name}-{self._name}-{mode.name}"
+        row = self.store.read(file, key)
+        if row is None:
+            if mode.name not in self._built:
+                self._built[mode.name] = self._build(mode, scene)
+            built, first_image_s = self._built[mode.name]
+            row = self._measure(mode, built, scene, self._name, self._tracers.spec.name, first_image_s)
+            self.store.write(file, key, row)
+            self.measured += 1
+        self.rows.append(row)
+
+    def _build(self, mode: Mode, scene: _Scene) -> tuple[OpticalMode, float | None]:
+        """The mode, and its time to the first image [s] unless one of its family came before."""
+        setting = Setting(self._tracers, self.size)
+        if mode.prepare is not None:
+            mode.prepare(setting)
+        start = time.perf_counter()
+        built = mode.build(setting)
+        _rgb(built, scene.surface)
+        return built, None if mode.family in self._families else time.perf_counter() - start
 
     def _key(self, mode: Mode, scene: _Scene) -> str:
         settings = self.settings

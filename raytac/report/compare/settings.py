@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from raytac.checks import check_known, check_seed
 from raytac.errors import BackendError, InputError
 from raytac.markers.base import marker_motion_of
+from raytac.report.compare.modes import Mode, chosen_modes, comparison_modes
 from raytac.report.image_error import SSIM_BORDER
 from raytac.sensor import LARGEST_SIDE
 from raytac.specs import PADS, load_press, load_sensor, validate_press
 
-SPP = (1, 4, 16, 64)
+MODES = ("fast", "taxim", "taxim_shadow", "phong", "reference", "path")
+"""Modes of a comparison in minutes; ``full`` adds variants, denoiser, networks and peer."""
+SPP = (4, 16)
 """Samples a pixel of the sampled modes."""
+
+
+_RENDERS = 9
+"""Renders for a row of a sampled mode: image, warm-up, timings, memory; some are slower."""
+_TIMINGS, _FRAME_S, _BUILD_S = 2.5, 0.1, 3.0
+"""Timings of a row, time of a frame and of building a mode [s], for an estimate."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,15 +38,17 @@ class CompareSettings:
     """(width, height) of the images [px]."""
     device: str = "auto"
     seed: int = 0
-    reference_spp: int = 1024
+    modes: tuple[str, ...] | None = MODES
+    """Names or families of modes; None is all that are registered."""
+    reference_spp: int = 512
     """Samples a pixel of the reference, half of them in each of its halves."""
     spp: tuple[int, ...] = SPP
     """Samples a pixel at which the sampled modes are measured."""
     batch: int | None = None
     """Environments of the batched timing; None is ``compare.BATCH`` of the device."""
-    frames: int = 60
+    frames: int = 30
     """Timed frames a figure, fewer for a mode that would need more than ``budget_s``."""
-    budget_s: float = 10.0
+    budget_s: float = 1.0
     """Longest time for one timing [s], as far as three frames allow."""
     quick: bool = False
     """Fewer modes."""
@@ -44,8 +57,13 @@ class CompareSettings:
     markers: bool = False
     """Also measure marker models against surface tracking, on level ``pad`` or the default."""
 
+    @classmethod
+    def full(cls, **settings: Any) -> CompareSettings:
+        """Every mode, more samples, longer timings: half an hour in place of minutes."""
+        return cls(**({"modes": None, "reference_spp": 1024, "spp": (1, 4, 16, 64), "frames": 60, "budget_s": 10.0} | settings))
+
     def quickened(self) -> CompareSettings:
-        """The first scene at 80 x 60 pixels with few samples, frames and modes."""
+        """The first scene at 80 x 60 pixels with few samples, frames and costly variants."""
         small = {"scenes": self.scenes[:1], "resolutions": ((80, 60),), "reference_spp": 32, "spp": (1, 4), "batch": 2}
         return replace(self, **small, frames=3, budget_s=0.5, quick=True)
 
@@ -80,6 +98,7 @@ class CompareSettings:
         stems = [Path(scene).stem for scene in self.scenes]
         if len(set(stems)) < len(stems):
             raise InputError("scenes", value=self.scenes, rule="must have different names, since rows are named after them")
+        chosen_modes(comparison_modes(self.spp), self.modes)
         spec = load_sensor(self.sensor)
         if self.markers:
             marker_motion_of(spec)
@@ -88,3 +107,18 @@ class CompareSettings:
         missing = [name for name in ("jinja2", "pyarrow", "skimage") if importlib.util.find_spec(name) is None]
         if missing:
             raise BackendError(f"the report needs {', '.join(missing)}: `pip install 'raytac[report]'`")
+
+
+def expected_seconds(settings: CompareSettings, modes: Sequence[Mode], sample_s: float) -> float:
+    """Estimated time of a comparison of which nothing is kept [s].
+
+    ``sample_s``: measured time of one sample a pixel of the reference at the first resolution [s]. Tables that have to be baked are not
+    in it.
+    """
+    width, height = settings.resolutions[0]
+    share = sum(w * h for w, h in settings.resolutions) / (width * height)
+    scene = settings.reference_spp * sample_s
+    for mode in modes:
+        renders = _RENDERS * (mode.spp or 0) * sample_s
+        scene += renders if mode.spp is not None else min(_TIMINGS * settings.budget_s, settings.frames * _FRAME_S)
+    return len(settings.scenes) * share * scene + _BUILD_S * len(modes) * len(settings.resolutions)

@@ -8,7 +8,7 @@ image at rest are what the bin's polynomial is fitted to, for touched pixels and
 
 from __future__ import annotations
 
-import sys
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +25,8 @@ from raytac.specs.sensor import SensorSpec
 
 MOVED = 5e-6
 """Least displacement [m] of a sample: a hundredth of a usual press, too little to show."""
+
+_LOG = logging.getLogger("raytac")
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ def baked_table(
     if table is None:
         if progress:
             where = "" if folder is None else f" and kept in {folder.parent}"
-            print(f"raytac: no table of {sensor.name} yet, so it is baked once{where}", file=sys.stderr)
+            _LOG.info("no table of %s yet, so it is baked once%s", sensor.name, where)
         table = bake(sensor, device=device, seed=seed, resolution=resolution, settings=settings, progress=progress).table
         if keep(table, folder):
             table = cached(folder) or table  # what later processes will read, to the last bit
