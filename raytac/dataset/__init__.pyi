@@ -13,3 +13,4 @@ from .run import RunReport as RunReport
 from .run import render_dataset as render_dataset
 from .run import verify_dataset as verify_dataset
 from .sheet import contact_sheet as contact_sheet
+from .tensors import PressTensors as PressTensors

@@ -100,6 +100,8 @@ def read_description(folder: Path) -> dict[str, Any]:
     for key, kind in _KEYS.items():
         if type(description.get(key)) is not kind:
             raise InputError("data set", value=path, rule=f"must have a key {key!r} of type {kind.__name__}")
+    if not isinstance(description["plan"].get("objects"), dict):
+        raise InputError("data set", value=path, rule="must have the objects of its plan, by name")
     for name, item in {**description["arrays"], **description["arrays_of_a_shard"]}.items():
         if not isinstance(item, dict) or item.get("dtype") not in _DTYPES or not _is_shape(item.get("shape")):
             rule = f"must declare array {name!r} by a shape and a known dtype"
