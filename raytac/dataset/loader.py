@@ -99,6 +99,13 @@ class PressDataset:
         self._rows: np.ndarray = self.manifest["row"].to_numpy()
         self._open: dict[str, dict[str, np.ndarray]] = {}
 
+    @property
+    def frames(self) -> int | None:
+        """Frames T of every press of a data set of videos; None where presses have one frame."""
+        if "T" not in self.description["arrays"]["pad_from_object"]["shape"]:
+            return None
+        return int(next(iter(self.description["sensors"].values()))["arrays"]["pad_from_object"][1])
+
     def __len__(self) -> int:
         return len(self._rows)
 
