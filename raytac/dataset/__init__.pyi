@@ -6,6 +6,7 @@ from .episode import press_episodes as press_episodes
 from .episode import record_episode as record_episode
 from .exports import write_hdf5 as write_hdf5
 from .exports import write_zarr as write_zarr
+from .lerobot import write_lerobot as write_lerobot
 from .loader import PressDataset as PressDataset
 from .plan import DatasetPlan as DatasetPlan
 from .plan import Presses as Presses
