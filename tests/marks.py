@@ -55,6 +55,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "ipc",
         "markers",
         "observe/test_depth_images.py",
+        "observe/test_device_images.py",
         "observe/test_observer.py",
         "gel/test_elastic_surround.py",
         "gel/test_pyramid.py",

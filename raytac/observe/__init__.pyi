@@ -1,5 +1,5 @@
-from .depth_images import DepthCamera as DepthCamera
-from .depth_images import DepthImages as DepthImages
+from .device_images import DepthCamera as DepthCamera
+from .device_images import DepthImages as DepthImages
 from .device_images import DeviceImages as DeviceImages
 from .observer import TactileObserver as TactileObserver
 from .randomization import Randomization as Randomization
