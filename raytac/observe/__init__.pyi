@@ -5,6 +5,8 @@ from .observer import TactileObserver as TactileObserver
 from .randomization import Randomization as Randomization
 from .randomization import randomised_bodies as randomised_bodies
 from .randomization import randomised_sensor as randomised_sensor
+from .ros import ROS_TYPES as ROS_TYPES
+from .ros import ros_messages as ros_messages
 from .settings import MODALITIES as MODALITIES
 from .settings import SCALES as SCALES
 from .settings import ObservationSettings as ObservationSettings

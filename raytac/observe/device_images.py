@@ -169,6 +169,7 @@ class DepthImages:
     rigid pad's surface. The other simulator must let bodies overlap the gel by the depth of the imprint.
 
     Attributes:
+        grid: nodes of the pad; ``grid.rest`` is its surface at rest.
         height: z of the gel's surface, pad frame [m], (B, Ny, Nx), float32, a Warp array that the next call overwrites.
         contact: 1 where something touches, (B, Ny, Nx), uint8, likewise.
         lost: 1 in environments that press the gel through, which are shown at rest, (B,), int32, likewise.
@@ -190,7 +191,8 @@ class DepthImages:
         start_warp()
         self._device = wp.get_device(resolve_device(device))
         sensor = observer.make_sensor(device="cuda" if self._device.is_cuda else "cpu")
-        self._images, grid = DeviceImages(observer, sensor), sensor.grid
+        self._images, self.grid = DeviceImages(observer, sensor), sensor.grid
+        grid = self.grid
         self._count, (ny, nx) = observer.num_envs, grid.shape
         thickness = observer.sensor.gelpad.thickness
         self._surround = ElasticSurround(grid, thickness=thickness, num_envs=self._count, device=str(self._device))
