@@ -33,8 +33,8 @@ class Lift:
 class AsGymnasium(gymnasium.Env):
     def __init__(self, inner, actions: int) -> None:
         self.inner, self.action_space = inner, gymnasium.spaces.Box(-1.0, 1.0, (actions,))
-        seen = {name: gymnasium.spaces.Box(-np.inf, np.inf, np.shape(v), np.float64) for name, v in inner.reset().items()}
-        self.observation_space = gymnasium.spaces.Dict(**seen)
+        seen = [(name, gymnasium.spaces.Box(-np.inf, np.inf, np.shape(v), np.float64)) for name, v in inner.reset().items()]
+        self.observation_space = gymnasium.spaces.Dict(seen)
 
     def reset(self, *, seed=None, options=None):
         return dict(self.inner.reset()), {}
