@@ -1,6 +1,12 @@
 from .arrays import ARRAYS as ARRAYS
 from .arrays import COLUMNS as COLUMNS
 from .arrays import DATASET_OUTPUTS as DATASET_OUTPUTS
+from .episode import Episode as Episode
+from .episode import press_episodes as press_episodes
+from .episode import record_episode as record_episode
+from .exports import write_hdf5 as write_hdf5
+from .exports import write_zarr as write_zarr
+from .lerobot import write_lerobot as write_lerobot
 from .loader import PressDataset as PressDataset
 from .plan import DatasetPlan as DatasetPlan
 from .plan import Presses as Presses
@@ -13,3 +19,4 @@ from .run import RunReport as RunReport
 from .run import render_dataset as render_dataset
 from .run import verify_dataset as verify_dataset
 from .sheet import contact_sheet as contact_sheet
+from .tensors import PressTensors as PressTensors

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 DATASET_OUTPUTS = ("rgb", "normals", "depth", "height", "contact", "wrench", "traction")
 """Names that ``outputs`` of a sweep accepts."""
@@ -15,19 +15,22 @@ class ArrayKind:
 
     dtype: str
     shape: tuple[int | str, ...]
-    """Numbers, or H, W of the image, Ny, Nx of the pad's grid, M markers."""
+    """Numbers, or H, W of the image, Ny, Nx of the pad's grid, M markers, T frames."""
     unit: str
     meaning: str
     needs: str = ""
-    """Output that it comes with, ``markers``, or nothing: always there."""
+    """Output that it comes with, ``markers``, ``video``, or nothing: always there."""
+    changes: bool = True
+    """True if a video has one of every frame; else it has one in all."""
 
-    def is_kept(self, outputs: Collection[str], markers: bool) -> bool:
+    def is_kept(self, outputs: Collection[str], markers: bool = False, video: bool = False) -> bool:
         """True if a sweep with these outputs keeps it."""
-        return self.needs == "" or self.needs in outputs or (self.needs == "markers" and markers)
+        extra = {"markers": markers, "video": video}
+        return self.needs == "" or self.needs in outputs or extra.get(self.needs, False)
 
 
 ARRAYS: dict[str, ArrayKind] = {
-    "index": ArrayKind("int64", (), "", "number of the press in the data set"),
+    "index": ArrayKind("int64", (), "", "number of the press in the data set", changes=False),
     "rgb": ArrayKind("uint8", ("H", "W", 3), "0-255", "image after the camera's response; row 0 is pad-frame -y", "rgb"),
     "normals": ArrayKind(
         "float32", ("H", "W", 3), "", "unit normal of the coat towards the camera (n_z < 0), pad frame", "normals"
@@ -57,12 +60,26 @@ ARRAYS: dict[str, ArrayKind] = {
     "markers_px": ArrayKind(
         "float32", ("M", 2), "px", "displacement of the markers along u, v of the image; NaN likewise", "markers"
     ),
-    "markers_rest": ArrayKind("float32", ("M", 3), "m", "places of the markers at rest, pad frame", "markers"),
-    "markers_rest_px": ArrayKind("float32", ("M", 2), "px", "places of the markers at rest in the image", "markers"),
+    "markers_rest": ArrayKind("float32", ("M", 3), "m", "places of the markers at rest, pad frame", "markers", changes=False),
+    "markers_rest_px": ArrayKind(
+        "float32", ("M", 2), "px", "places of the markers at rest in the image", "markers", changes=False
+    ),
     "marker_visible": ArrayKind("bool", ("M",), "", "whether the tracker finds the marker", "markers"),
     "pad_from_object": ArrayKind("float64", (4, 4), "m", "pose of the object when the image is taken, pad frame"),
+    "travel": ArrayKind(
+        "float64", (), "m", "travel of the object below first touch when the image is taken, negative above it", "video"
+    ),
 }
 """By name."""
+
+
+def press_arrays(outputs: Collection[str], *, markers: bool, video: bool) -> dict[str, ArrayKind]:
+    """Arrays of a press that a sweep keeps; those that change have T frames first in a video."""
+    kept = {name: kind for name, kind in ARRAYS.items() if kind.is_kept(outputs, markers, video)}
+    if not video:
+        return kept
+    return {name: replace(kind, shape=("T", *kind.shape)) if kind.changes else kind for name, kind in kept.items()}
+
 
 SHARED: dict[str, ArrayKind] = {
     "grid_x": ArrayKind("float64", ("Nx",), "m", "x of the columns of height, contact and traction, pad frame"),

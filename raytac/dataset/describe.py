@@ -53,7 +53,6 @@ def describe(plan: DatasetPlan, records: Sequence[ShardRecord], manifest: Path |
             "pad_thickness_m": sensor.gelpad.thickness,
             "arrays": {name: ["N", *shape] for name, shape in shapes.items()},
         }
-    kept = plan.array_shapes(plan.sweep.sensors[0])
     return {
         "format": "raytac presses",
         "format_version": FORMAT_VERSION,
@@ -65,10 +64,8 @@ def describe(plan: DatasetPlan, records: Sequence[ShardRecord], manifest: Path |
         "shards": plan.shards,
         "manifest_sha256": sha256_of(manifest) if manifest is not None else "",
         "frame": _FRAME,
-        "arrays": {name: _declared(array, "N") for name, array in ARRAYS.items() if name in kept},
-        "arrays_of_a_shard": {
-            name: _declared(array) for name, array in SHARED.items() if array.is_kept(plan.sweep.outputs, False)
-        },
+        "arrays": {name: _declared(array, "N") for name, array in plan.arrays.items()},
+        "arrays_of_a_shard": {name: _declared(array) for name, array in plan.shared.items()},
         "columns": {name: {"type": c.type, "unit": c.unit, "meaning": c.meaning} for name, c in COLUMNS.items()},
         "sensors": sensors,
         "made_by": list(made.values()),
@@ -100,6 +97,8 @@ def read_description(folder: Path) -> dict[str, Any]:
     for key, kind in _KEYS.items():
         if type(description.get(key)) is not kind:
             raise InputError("data set", value=path, rule=f"must have a key {key!r} of type {kind.__name__}")
+    if not isinstance(description["plan"].get("objects"), dict):
+        raise InputError("data set", value=path, rule="must have the objects of its plan, by name")
     for name, item in {**description["arrays"], **description["arrays_of_a_shard"]}.items():
         if not isinstance(item, dict) or item.get("dtype") not in _DTYPES or not _is_shape(item.get("shape")):
             rule = f"must declare array {name!r} by a shape and a known dtype"
@@ -154,7 +153,7 @@ def _readme(description: dict[str, Any]) -> str:
         "",
         *table(description["arrays_of_a_shard"], "type (shape)"),
         "",
-        "H, W: image; Ny, Nx: grid over the pad; M: markers. By sensor:",
+        "H, W: image; Ny, Nx: grid over the pad; M: markers; T: frames. By sensor:",
         "",
         *(
             f"- `{name}`: " + ", ".join(f"{key} {tuple(shape)}" for key, shape in sensor["arrays"].items())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, SupportsIndex
@@ -16,6 +16,11 @@ from raytac.dataset.manifest import read_manifest
 from raytac.dataset.shard import FOLDER, is_shard_file, open_shard
 from raytac.errors import InputError
 
+_TEXTS = ("object", "sensor")
+"""Columns of text that a sample may hold."""
+_LABEL = "label"
+"""Name of the number of a press's object among the classes."""
+
 
 class PressDataset:
     """Sound presses of a data set, as a map-style data set of PyTorch has them.
@@ -24,9 +29,12 @@ class PressDataset:
 
     .. code-block:: python
 
-        data = PressDataset("runs/dataset", ("rgb", "wrench", "press_depth"))
-        data[0]  # {"rgb": (H, W, 3) uint8, "wrench": (6,), "press_depth": ()}
+        data = PressDataset("runs/dataset", ("rgb", "wrench", "press_depth", "label"))
+        data[0]  # {"rgb": (H, W, 3) uint8, "wrench": (6,), "press_depth": (), "label": ()}
+        data.classes[data[0]["label"]]  # "sphere"
         loader = torch.utils.data.DataLoader(data, batch_size=64, shuffle=True, num_workers=4)
+
+    ``PressTensors`` gives the same as tensors, channels first.
 
     Arrays that are not compressed are mapped into memory, so that a press is read without the rest of its shard. What is given is a copy
     that may be changed. Manifest and shards are compared with their checksums when they are opened, which reads a shard once as a whole;
@@ -35,17 +43,27 @@ class PressDataset:
     Attributes:
         description: its ``dataset.json``.
         manifest: rows of the presses that are given, a ``pyarrow.Table``.
+        classes: names of the objects of its plan, whose numbers the labels are; the same for every part of the data set.
     """
 
     def __init__(
-        self, folder: str | Path, names: Sequence[str] | None = None, *, sensor: str | None = None, verify: bool = True
+        self,
+        folder: str | Path,
+        names: Sequence[str] | None = None,
+        *,
+        sensor: str | None = None,
+        verify: bool = True,
+        transform: Callable[[dict[str, Any]], Any] | None = None,
     ) -> None:
         """Read the manifest.
 
         Args:
-            names: arrays of the shards, or columns of numbers of the manifest; None is all arrays.
+            names: arrays of the shards, one of a press or one of a shard, such as ``rest_rgb``; columns of numbers of the manifest; its
+                texts ``object`` and ``sensor``; and ``label``, the number of the object in ``classes``. None is all arrays of a press, its
+                object and its label.
             sensor: presses into this sensor only; must be given where the data set has several of different shapes and a stack is wanted.
             verify: compare manifest and shards with their checksums.
+            transform: function of a sample, whose result is given in its place. Processes of a loader need one that can be pickled.
 
         Raises:
             InputError: no data set, one that is damaged or (with ``verify``) not complete, or a name that it does not have.
@@ -65,37 +83,72 @@ class PressDataset:
                 raise InputError("sensor", value=sensor, rule="must be in the data set", choices=known)
             keep &= np.asarray(table["sensor"].to_pylist()) == sensor
         self.manifest = table.filter(keep)
-        arrays = tuple(self.description["arrays"])
-        numbers = tuple(name for name, column in COLUMNS.items() if column.type != "string")
-        names = arrays if names is None else tuple(names)
+        self.classes: tuple[str, ...] = tuple(self.description["plan"]["objects"])
+        arrays, once = tuple(self.description["arrays"]), tuple(self.description["arrays_of_a_shard"])
+        known = (*arrays, *once, *(name for name, column in COLUMNS.items() if column.type != "string"), *_TEXTS, _LABEL)
+        names = (*arrays, "object", _LABEL) if names is None else tuple(names)
         for name in names:
-            if name not in arrays and name not in numbers:
-                raise InputError("names", value=name, rule="must be an array or a column of numbers", choices=(*arrays, *numbers))
-        self._arrays = tuple(name for name in names if name in arrays)
-        self._columns = {name: self.manifest[name].to_numpy(zero_copy_only=False) for name in names if name not in arrays}
+            if name not in known:
+                rule = "must be an array, a column of numbers, or a name or label of what was pressed"
+                raise InputError("names", value=name, rule=rule, choices=known)
+        if transform is not None and not callable(transform):
+            raise InputError("transform", value=transform, rule="must be a function of a sample")
+        self._names, self._transform = names, transform
+        self._columns = {name: self._column(name) for name in names if name not in (*arrays, *once)}
         self._shards: list[str] = self.manifest["shard"].to_pylist()
         self._rows: np.ndarray = self.manifest["row"].to_numpy()
         self._open: dict[str, dict[str, np.ndarray]] = {}
 
+    @property
+    def frames(self) -> int | None:
+        """Frames T of every press of a data set of videos; None where presses have one frame."""
+        if "T" not in self.description["arrays"]["pad_from_object"]["shape"]:
+            return None
+        return int(next(iter(self.description["sensors"].values()))["arrays"]["pad_from_object"][1])
+
     def __len__(self) -> int:
         return len(self._rows)
 
-    def __getitem__(self, i: SupportsIndex) -> dict[str, np.ndarray]:
+    def __getitem__(self, i: SupportsIndex) -> dict[str, Any]:
         """Press ``i`` of those in ``manifest``, counted from the end if it is negative.
+
+        Arrays of NumPy, but for ``object`` and ``sensor``, which are texts; or what ``transform`` makes of it.
 
         Raises:
             IndexError: there is no such press.
             InputError: ``i`` is no whole number, or the shard is damaged.
         """
         i = self._place(i)
-        shard, row = self._shards[i], self._rows[i]
-        arrays = {name: np.array(self._shard(shard)[name][row]) for name in self._arrays}
-        return arrays | {name: np.asarray(values[i]) for name, values in self._columns.items()}
+        row, once = self._rows[i], self.description["arrays_of_a_shard"]
+        sample: dict[str, Any] = {}
+        for name in self._names:
+            if name in self._columns:
+                value = self._columns[name][i]
+                sample[name] = value if name in _TEXTS else np.asarray(value)
+            else:
+                values = self._shard(self._shards[i])[name]
+                sample[name] = np.array(values if name in once else values[row])
+        return sample if self._transform is None else self._transform(sample)
 
     def shared(self, i: SupportsIndex) -> dict[str, np.ndarray]:
         """Arrays of press ``i``'s shard: grid, height and image at rest. Errors as for ``data[i]``."""
         shard = self._shard(self._shards[self._place(i)])
         return {name: np.array(shard[name]) for name in self.description["arrays_of_a_shard"]}
+
+    def _column(self, name: str) -> Any:
+        """Values by press: of a column of the manifest, or the labels."""
+        if name in _TEXTS:
+            return self.manifest[name].to_pylist()
+        if name != _LABEL:
+            return self.manifest[name].to_numpy(zero_copy_only=False)
+        numbers = {name: number for number, name in enumerate(self.classes)}
+        objects = self.manifest["object"].to_pylist()
+        for name in objects:
+            if name not in numbers:
+                raise InputError(
+                    "data set", value=name, rule=f"is not an object of the plan of {self.folder}", choices=self.classes
+                )
+        return np.array([numbers[name] for name in objects], np.int64)
 
     def _place(self, i: SupportsIndex) -> int:
         try:

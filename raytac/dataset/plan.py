@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from raytac.dataset.arrays import ARRAYS, DATASET_OUTPUTS, SHARED, ArrayKind
+from raytac.dataset.arrays import DATASET_OUTPUTS, SHARED, ArrayKind, press_arrays
 from raytac.errors import InputError, RaytacError, SpecError
 from raytac.gel.surface import PadGrid, grid_pitch, make_grid
 from raytac.markers import MARKERS, MarkerPerturbation
@@ -21,7 +21,7 @@ from raytac.markers.pattern import MarkerPattern
 from raytac.observe import Randomization, randomised_sensor
 from raytac.physics.registry import scene_physics
 from raytac.sensor import TactileSensor
-from raytac.specs import PressScene, SensorSpec, StageSpec, SweepSpec
+from raytac.specs import PressRanges, PressScene, SensorSpec, StageSpec, SweepSpec
 from raytac.specs.toml import in_mm
 
 _DRAWS = 10
@@ -181,24 +181,41 @@ class DatasetPlan:
         pitch = self.sweep.pitch or grid_pitch(sensor.camera.pitch_at(self.resolution(sensor)))
         return make_grid(sensor.gelpad, pitch)
 
-    def array_shapes(self, sensor: SensorSpec, kinds: Mapping[str, ArrayKind] = ARRAYS) -> dict[str, tuple[int, ...]]:
-        """Shape of every array of one press, by name; and ``SHARED`` of those once a shard."""
+    @cached_property
+    def arrays(self) -> dict[str, ArrayKind]:
+        """Arrays of one press that shards keep."""
+        sweep = self.sweep
+        return press_arrays(sweep.outputs, markers=sweep.markers is not None, video=sweep.frames_per_stage is not None)
+
+    @cached_property
+    def shared(self) -> dict[str, ArrayKind]:
+        """Arrays that shards keep once."""
+        return {name: array for name, array in SHARED.items() if array.is_kept(self.sweep.outputs)}
+
+    @property
+    def frames(self) -> int:
+        """Frames of a press: 1, or those of a video."""
+        each = self.sweep.frames_per_stage
+        return 1 if each is None else 1 + each * len(press_stages(self.sweep.ranges))
+
+    def array_shapes(self, sensor: SensorSpec, kinds: Mapping[str, ArrayKind] | None = None) -> dict[str, tuple[int, ...]]:
+        """Shape of every array of one press, by name; with ``shared``, of those once a shard."""
         width, height = self.resolution(sensor)
         rows, columns = self.grid(sensor).shape
-        sizes = {"H": height, "W": width, "Ny": rows, "Nx": columns, "M": sensor.markers.rows * sensor.markers.columns}
-        markers = self.sweep.markers is not None
-        kept = {name: array for name, array in kinds.items() if array.is_kept(self.sweep.outputs, markers)}
-        return {name: tuple(sizes[n] if isinstance(n, str) else n for n in array.shape) for name, array in kept.items()}
+        count = sensor.markers.rows * sensor.markers.columns
+        sizes = {"H": height, "W": width, "Ny": rows, "Nx": columns, "M": count, "T": self.frames}
+        kinds = self.arrays if kinds is None else kinds
+        return {name: tuple(sizes[n] if isinstance(n, str) else n for n in array.shape) for name, array in kinds.items()}
 
     def press_bytes(self, sensor: SensorSpec) -> int:
         """Bytes on disk of one press, not compressed, without the arrays once a shard."""
-        return _bytes(self.array_shapes(sensor), ARRAYS)
+        return _bytes(self.array_shapes(sensor), self.arrays)
 
     def shard_bytes(self, shard: int) -> int:
         """Bytes on disk of a shard, not compressed, but for some kilobytes of headers and rows."""
         sensor = self.sweep.sensors[self.variant(shard)[0]]
         count = min(self.sweep.shard_size, self.sweep.count - shard * self.sweep.shard_size)
-        return count * self.press_bytes(sensor) + _bytes(self.array_shapes(sensor, SHARED), SHARED)
+        return count * self.press_bytes(sensor) + self._shared_bytes(sensor)
 
     def total_bytes(self, without: Collection[int] = ()) -> int:
         """Bytes on disk of all shards but those ``without``, in a time that does not grow."""
@@ -206,12 +223,15 @@ class DatasetPlan:
         done = Counter(shard % kinds for shard in without)  # shards take turns over the sensors
         total = 0
         for k, sensor in enumerate(self.sweep.sensors):
-            full = self.sweep.shard_size * self.press_bytes(sensor) + _bytes(self.array_shapes(sensor, SHARED), SHARED)
+            full = self.sweep.shard_size * self.press_bytes(sensor) + self._shared_bytes(sensor)
             total += full * (len(range(k, self.shards, kinds)) - done[k])
         if last not in without:
             absent = self.shards * self.sweep.shard_size - self.sweep.count
             total -= absent * self.press_bytes(self.sweep.sensors[last % kinds])
         return total
+
+    def _shared_bytes(self, sensor: SensorSpec) -> int:
+        return _bytes(self.array_shapes(sensor, self.shared), self.shared)
 
     @cached_property
     def description(self) -> dict[str, Any]:
@@ -222,6 +242,7 @@ class DatasetPlan:
                 name: value
                 for name, value in vars(sweep).items()
                 if name not in ("sensors", "objects", "source", "ranges", "name")
+                and (name, value) != ("frames_per_stage", None)  # so older data sets go on
             },
             "press": {name: list(ends) for name, ends in vars(sweep.ranges).items()},
             "sensors": {s.name: _sensor_digest(s) for s in sweep.sensors},
@@ -265,14 +286,19 @@ class DatasetPlan:
         return SpecError(rule, file=self.sweep.source, key=f"press.{key}", value=in_mm(ends))
 
 
-def press_scene_of(scene: PressScene, ranges: Any) -> PressScene:
-    """A scene's object with the trajectory of a sweep: indent, then shear and twist, if any."""
+def press_stages(ranges: PressRanges) -> tuple[StageSpec, ...]:
+    """Trajectory of a sweep's presses: indent, then shear and twist, if any."""
     stages = [StageSpec("indent", depth=ranges.depth[1])]
     if ranges.shear != (0.0, 0.0):
         stages.append(StageSpec("shear"))
     if ranges.twist != (0.0, 0.0):
         stages.append(StageSpec("twist"))
-    return replace(scene, trajectory=tuple(stages), source=None, physics=None, pad=None)
+    return tuple(stages)
+
+
+def press_scene_of(scene: PressScene, ranges: PressRanges) -> PressScene:
+    """A scene's object with the trajectory of a sweep."""
+    return replace(scene, trajectory=press_stages(ranges), source=None, physics=None, pad=None)
 
 
 def _bytes(shapes: Mapping[str, tuple[int, ...]], kinds: Mapping[str, ArrayKind]) -> int:

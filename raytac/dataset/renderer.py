@@ -60,6 +60,14 @@ class _Built:
     shared: dict[str, np.ndarray]
 
 
+@dataclass(frozen=True)
+class _Taken:
+    """Frame of B environments, and the travel below first touch when it was taken [m], (B,)."""
+
+    frame: TactileFrame
+    travel: np.ndarray
+
+
 class ShardRenderer:
     """Renders shards of one plan, in any order; a shard does not depend on those before.
 
@@ -87,15 +95,15 @@ class ShardRenderer:
             places = np.flatnonzero(presses.scene == which)
             for start in range(0, len(places), self.job.batch):
                 chosen = places[start : start + self.job.batch]
-                frame, reasons = self._press(built, scene, presses[chosen])
-                made = self._arrays(built, frame, presses[chosen])
+                frames, reasons = self._press(built, scene, presses[chosen])
+                made = self._arrays(built, frames, presses[chosen])
                 for b, place in enumerate(chosen.tolist()):
                     own = {name: values[b] for name, values in made.items()}
                     reason = reasons[b] or _not_finite(own)
                     notes[place] = {"status": "failed" if reason else "ok", "reason": reason}
                     if not reason:
                         arrays[place] = own
-                        notes[place] |= _figures(frame, b)
+                        notes[place] |= _figures(frames[-1].frame, b)
         order = sorted(arrays)
         joined = {name: np.stack([arrays[place][name] for place in order]) for name in arrays[order[0]]} if order else {}
         rows = [self._row(shard, presses, place, notes[place]) for place in range(len(presses))]
@@ -122,14 +130,17 @@ class ShardRenderer:
         drift = CameraDrift(spec, plan.randomization, batch, 0) if plan.randomization.changes_images else None
         return _Built(sensor, drift, shared)
 
-    def _press(self, built: _Built, scene: PressScene, presses: Presses) -> tuple[TactileFrame, list[str]]:
-        """Frame of B environments, the first of which are the presses, and why each failed (or "")."""
+    def _press(self, built: _Built, scene: PressScene, presses: Presses) -> tuple[list[_Taken], list[str]]:
+        """Frames of B environments, the first of which are the presses, and why each failed (or "").
+
+        They are those of a video, or the peak's alone.
+        """
         reasons = [""] * len(presses)
         own = self._own(presses)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NarrowContactWarning)  # every press tells its contact_cells
             try:
-                frame = built.sensor.press(scene, **own)
+                taken = self._taken(built.sensor, scene, own)
             except (BackendError, AssetError):
                 raise
             except RaytacError:
@@ -140,11 +151,19 @@ class ShardRenderer:
                     raise
                 refused = np.flatnonzero([bool(reason) for reason in reasons])
                 own["offsets"][refused] = np.nan
-                frame = built.sensor.press(scene, **own)
+                taken = self._taken(built.sensor, scene, own)
         for b in range(len(presses)):
-            if frame.failed[b] and not reasons[b]:
+            if any(one.frame.failed[b] for one in taken) and not reasons[b]:
                 reasons[b] = _UNSETTLED
-        return frame, reasons
+        return taken, reasons
+
+    def _taken(self, sensor: TactileSensor, scene: PressScene, own: dict[str, Any]) -> list[_Taken]:
+        each = self.plan.sweep.frames_per_stage
+        if each is None:
+            return [_Taken(sensor.press(scene, **own), np.full(self.job.batch, np.nan))]
+        readings = sensor.load(scene, **own).run(each)
+        # A frame waits for its images when it is read: read now, so that those of a whole press do not wait on the device.
+        return [_Taken(frame, reading.depth) for reading in readings if (frame := sensor.update(reading)).outputs]
 
     def _own(self, presses: Presses, batch: int | None = None) -> dict[str, Any]:
         """Arguments of ``TactileSensor.press``; environments without a press fail from the start."""
@@ -178,27 +197,41 @@ class ShardRenderer:
             return str(error)
         return ""
 
-    def _arrays(self, built: _Built, frame: TactileFrame, presses: Presses) -> dict[str, np.ndarray]:
+    def _arrays(self, built: _Built, taken: list[_Taken], presses: Presses) -> dict[str, np.ndarray]:
+        """Arrays (N, …), or (N, T, …) of a video, of the presses."""
+        self._begin_drift(built, presses)
+        frames = [self._arrays_of(built, one, presses) for one in taken]
+        if self.plan.sweep.frames_per_stage is None:
+            return frames[0]
+        return {
+            name: np.stack([frame[name] for frame in frames], axis=1) if ARRAYS[name].changes else first
+            for name, first in frames[0].items()
+        }
+
+    def _arrays_of(self, built: _Built, taken: _Taken, presses: Presses) -> dict[str, np.ndarray]:
+        """Arrays (N, …) of one frame."""
+        frame = taken.frame
         outputs, surface = self.plan.sweep.outputs, frame.surface
         arrays: dict[str, Any] = {name: getattr(frame, name) for name in outputs if name not in ("rgb", "contact")}
         arrays |= {"index": presses.index, "pad_from_object": surface.pad_from_object}
+        if "travel" in self.plan.arrays:
+            arrays["travel"] = taken.travel
         if "contact" in outputs:
             arrays["contact"] = surface.contact
         if "rgb" in frame.outputs:
-            arrays["rgb"] = self._drifted(built, frame.rgb, presses)
+            arrays["rgb"] = frame.rgb if built.drift is None else built.drift.apply(frame.rgb)
         if "markers" in frame.outputs:
             m = frame.markers
             arrays |= {"markers": m.displacement, "markers_px": m.displacement_px, "markers_rest": m.rest}
             arrays |= {"markers_rest_px": m.rest_px, "marker_visible": m.visible}
         return {name: np.asarray(values[: len(presses)], ARRAYS[name].dtype) for name, values in arrays.items()}
 
-    def _drifted(self, built: _Built, rgb: np.ndarray, presses: Presses) -> np.ndarray:
-        if built.drift is None:
-            return rgb
-        which = range(len(presses))
-        built.drift.reseed(which, presses.seed.tolist())
-        built.drift.reset(which)
-        return built.drift.apply(rgb)
+    def _begin_drift(self, built: _Built, presses: Presses) -> None:
+        """Draw the camera of every press; noise is drawn of every frame."""
+        if built.drift is not None:
+            which = range(len(presses))
+            built.drift.reseed(which, presses.seed.tolist())
+            built.drift.reset(which)
 
     def _row(self, shard: int, presses: Presses, place: int, note: Mapping[str, Any]) -> Row:
         which, copy = self.plan.variant(shard)

@@ -31,6 +31,8 @@ def contact_sheet(data: PressDataset, count: int = 24, columns: int = 6) -> np.n
 def contact_figure(data: PressDataset, count: int = 24, columns: int = 6) -> Figure:
     """Figure of the first ``count`` presses: number, object, depth, image and indentation.
 
+    Of videos it shows the last frames.
+
     All maps have one colour scale, from 0 (what comes up counts as 0) to the greatest indentation shown.
 
     Raises ``InputError``: the data set has neither images nor heights, or no sound press, or a number is not whole or below 1.
@@ -49,7 +51,8 @@ def contact_figure(data: PressDataset, count: int = 24, columns: int = 6) -> Fig
     axes = figure.subplots(rows * len(shown), columns, squeeze=False)
     for axis in axes.flat:
         axis.set_axis_off()
-    dents = [data.shared(i)["rest_height"].astype(float) - data[i]["height"] for i in presses if "height" in shown]
+    samples = [{name: data[i][name][-1] if data.frames else data[i][name] for name in shown} for i in presses]
+    dents = [data.shared(i)["rest_height"].astype(float) - samples[i]["height"] for i in presses if "height" in shown]
     deepest = max((float(np.nanmax(dent)) for dent in dents), default=0.0)
     maps = None
     for i in presses:
@@ -57,7 +60,7 @@ def contact_figure(data: PressDataset, count: int = 24, columns: int = 6) -> Fig
         block[0].set_title(_title(data, i), fontsize=8, pad=3)
         for axis, name in zip(block, shown, strict=True):
             if name == "rgb":
-                axis.imshow(data[i]["rgb"])
+                axis.imshow(samples[i]["rgb"])
                 pixel = data.description["sensors"][data.manifest["sensor"][i].as_py()]["pixel_m"][0]
                 _bar(axis, _BAR / pixel)
             else:

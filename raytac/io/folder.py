@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import secrets
 import shutil
 import stat
 import tempfile
@@ -14,9 +15,31 @@ from pathlib import Path
 from types import TracebackType
 
 from raytac.errors import InputError, RaytacError
+from raytac.io.atomic import PARTIAL
 
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 """Numbers of the errors of a disk, or of what standard output goes to."""
+
+
+@contextmanager
+def new_path(path: str | Path) -> Iterator[Path]:
+    """A temporary name beside ``path`` for a file or folder, which takes its name at the end.
+
+    After an error nothing of it stays. Raises ``InputError``: ``path`` exists, or the folder that it is in does not, or cannot be written.
+    """
+    path = Path(path)
+    if os.path.lexists(path):
+        raise InputError("path", value=path, rule="must not exist: nothing is replaced")
+    if not path.parent.is_dir() or not os.access(path.parent, os.W_OK):
+        raise InputError("path", value=path, rule="must be in a folder that exists and can be written")
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}{PARTIAL}")
+    try:
+        yield partial
+        partial.rename(path)
+    finally:
+        if partial.is_dir():
+            shutil.rmtree(partial)
+        partial.unlink(missing_ok=True)
 
 
 @contextmanager

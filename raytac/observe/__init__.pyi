@@ -1,8 +1,12 @@
+from .device_images import DepthCamera as DepthCamera
+from .device_images import DepthImages as DepthImages
 from .device_images import DeviceImages as DeviceImages
 from .observer import TactileObserver as TactileObserver
 from .randomization import Randomization as Randomization
 from .randomization import randomised_bodies as randomised_bodies
 from .randomization import randomised_sensor as randomised_sensor
+from .ros import ROS_TYPES as ROS_TYPES
+from .ros import ros_messages as ros_messages
 from .settings import MODALITIES as MODALITIES
 from .settings import SCALES as SCALES
 from .settings import ObservationSettings as ObservationSettings

@@ -29,6 +29,7 @@ SWEEP_SCHEMA: Final[Schema] = {
     "resolution": Integer("[1, 8192]", length=2, default=None),
     "pitch_mm": Number("[0.01, 5]", default=None),
     "variants": Integer("[1, 10000]", default=1),
+    "frames_per_stage": Integer("[1, 1000]", default=None),
 }
 """Keys at the top of a sweep."""
 
@@ -121,6 +122,8 @@ class SweepSpec:
     """Spacing of the maps over the pad [m]; None is that of a pixel, at most 0.1 mm."""
     variants: int = 1
     """Drawn copies of every sensor, where the randomisation changes sensors."""
+    frames_per_stage: int | None = None
+    """Frames of a video through each stage, after one above the gel; None: the peak alone."""
     randomization: Mapping[str, float] = field(default_factory=dict)
     """Fields of ``raytac.observe.Randomization`` that ``RANDOMIZATION_SCHEMA`` has."""
     marker_perturbation: Mapping[str, float] = field(default_factory=dict)

@@ -46,9 +46,11 @@ def test_presses_are_those_of_the_shards(folders: dict[bool, Path], compress: bo
     data = PressDataset(folders[compress])
     assert len(data) == 10 and data.manifest["index"].to_pylist() == list(range(10))
     with np.load(folders[compress] / "shards/000001.npz") as shard:
-        assert set(data[4]) == set(shard.files) - {"grid_x", "grid_y", "rest_height"}
+        assert set(data[4]) - {"object", "label"} == set(shard.files) - {"grid_x", "grid_y", "rest_height"}
         for i in range(4, 8):
             for name, values in data[i].items():
+                if name in ("object", "label"):
+                    continue
                 np.testing.assert_array_equal(values, shard[name][i - 4])
         np.testing.assert_array_equal(data.shared(5)["rest_height"], shard["rest_height"])
     assert data[-1]["index"] == 9
@@ -68,6 +70,46 @@ def test_names_columns_and_sensors_are_chosen(folders: dict[bool, Path]) -> None
         PressDataset(folders[False], ("heigt",))
     with pytest.raises(InputError, match="gelsight_mini_9x11"):
         PressDataset(folders[False], sensor="digit")
+
+
+def test_the_object_and_its_label_come_with_every_press(folders: dict[bool, Path]) -> None:
+    data = PressDataset(folders[False])
+    assert data.classes == ("sphere", "edge")
+    objects = data.manifest["object"].to_pylist()
+    assert set(objects) == set(data.classes)
+    for press, name in zip(data, objects, strict=True):  # type: ignore[call-overload]
+        assert press["object"] == name and data.classes[press["label"]] == name
+        assert press["label"].dtype == np.int64 and press["label"].shape == ()
+    one = PressDataset(folders[False], ("label", "sensor", "rest_height"), sensor="gelsight_mini")
+    assert one.classes == data.classes and one[0]["sensor"] == "gelsight_mini"
+    np.testing.assert_array_equal(one[0]["rest_height"], one.shared(0)["rest_height"])
+
+
+def test_a_transform_has_the_last_word(folders: dict[bool, Path]) -> None:
+    names = ("height", "rest_height", "label")
+    data = PressDataset(folders[False], names, transform=indentation)
+    made: Any = data[2]
+    dent, label = made
+    plain = PressDataset(folders[False], names)[2]
+    np.testing.assert_array_equal(dent, plain["rest_height"] - plain["height"])
+    assert label == plain["label"] and dent.max() > 0.2e-3
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(data))[2][0], dent)
+    with pytest.raises(InputError, match="must be a function of a sample"):
+        PressDataset(folders[False], transform="indentation")  # type: ignore[arg-type]
+
+
+def indentation(sample: dict[str, Any]) -> tuple[np.ndarray, int]:
+    return sample["rest_height"] - sample["height"], int(sample["label"])
+
+
+def test_an_object_that_the_plan_does_not_have_is_refused(folder: Path) -> None:
+    rewrite_manifest(folder, column("object", value="teapot"))
+    with pytest.raises(InputError, match="'teapot': is not an object of the plan"):
+        PressDataset(folder)
+    assert len(PressDataset(folder, ("height",))) == 10
+    rewrite_description(folder, plan={"objects": ["sphere"]})
+    with pytest.raises(InputError, match=r"dataset\.json: must have the objects"):
+        PressDataset(folder)
 
 
 def test_a_copy_in_another_process_opens_its_own_files(folders: dict[bool, Path]) -> None:

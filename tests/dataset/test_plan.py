@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from raytac.dataset import DatasetPlan
-from raytac.dataset.arrays import ARRAYS, SHARED
+from raytac.dataset.arrays import ARRAYS
 from raytac.errors import InputError, SpecError
 from raytac.specs import PressRanges, SweepSpec, load_press, load_sensor
 
@@ -106,14 +106,28 @@ def test_shapes_and_bytes_are_those_of_the_arrays(sweep: SweepSpec) -> None:
     sensor = sweep.sensors[0]
     shapes = plan.array_shapes(sensor)
     assert shapes["rgb"] == (24, 32, 3) and shapes["markers"] == (99, 2) and "traction" not in shapes
-    assert set(plan.array_shapes(sensor, SHARED)) == {"grid_x", "grid_y", "rest_height", "rest_rgb"}
-    assert set(DatasetPlan(replace(sweep, outputs=("wrench",), randomization={})).array_shapes(sensor, SHARED)) == {
-        "grid_x",
-        "grid_y",
-        "rest_height",
-    }
+    assert set(plan.array_shapes(sensor, plan.shared)) == {"grid_x", "grid_y", "rest_height", "rest_rgb"}
+    bare = DatasetPlan(replace(sweep, outputs=("wrench",), randomization={}))
+    assert set(bare.array_shapes(sensor, bare.shared)) == {"grid_x", "grid_y", "rest_height"}
     assert plan.shard_bytes(2) - plan.press_bytes(sensor) * 2 == plan.shard_bytes(0) - plan.press_bytes(sensor) * 4
     assert all(array.meaning for array in ARRAYS.values())
+
+
+def test_a_video_has_its_frames_first_in_what_changes(sweep: SweepSpec) -> None:
+    plan, video = DatasetPlan(sweep), DatasetPlan(replace(sweep, frames_per_stage=5))
+    assert (plan.frames, video.frames) == (1, 11)  # an indent and a shear
+    sensor = sweep.sensors[0]
+    still, moving = plan.array_shapes(sensor), video.array_shapes(sensor)
+    for name in ("rgb", "height", "contact", "wrench", "markers", "markers_px", "marker_visible", "pad_from_object"):
+        assert moving[name] == (11, *still[name])
+    for name in ("index", "markers_rest", "markers_rest_px"):
+        assert moving[name] == still[name]
+    assert set(moving) - set(still) == {"travel"} and moving["travel"] == (11,)
+    assert video.array_shapes(sensor, video.shared) == plan.array_shapes(sensor, plan.shared)
+    assert video.press_bytes(sensor) > 10 * plan.press_bytes(sensor)
+    assert "frames_per_stage" not in plan.description and video.description["frames_per_stage"] == 5
+    for name in ("x", "seed", "press_depth", "shear_x"):
+        np.testing.assert_array_equal(getattr(plan.presses(0), name), getattr(video.presses(0), name))
 
 
 def test_the_size_of_the_whole_is_the_sum_of_its_shards(sweep: SweepSpec) -> None:

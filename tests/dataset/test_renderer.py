@@ -23,7 +23,7 @@ def renderer(sweep: SweepSpec) -> ShardRenderer:
 def test_arrays_are_those_that_the_plan_tells(renderer: ShardRenderer) -> None:
     plan, result = renderer.plan, renderer.render(2)
     sensor = plan.sensor(2)
-    kept = plan.array_shapes(sensor) | plan.array_shapes(sensor, SHARED)
+    kept = plan.array_shapes(sensor) | plan.array_shapes(sensor, plan.shared)
     assert set(result.arrays) == set(kept)
     for name, values in result.arrays.items():
         shape = kept[name] if name in SHARED else (2, *kept[name])

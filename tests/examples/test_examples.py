@@ -13,13 +13,16 @@ ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 SAYS = {
     "batch": "load",
+    "foreign_depth": "of imprints [0.2 0.4 0.6 0.8] mm deep",
     "foreign_env": "right: pad pressed by 3.0",
     "foreign_loop": "the ball weighs 0.98",
+    "foreign_robosuite": "left: pad pressed by 3.0",
     "gym_env": "return after five random actions",
     "own_mujoco_model": "right: normal force",
     "own_vector_env": "force on each cube",
     "press": "force",
     "relight": "without blue",
+    "ros_messages": "deepest imprint in the cloud: ",
 }
 """A word that the last line of an example must hold, or any line where it has several kinds."""
 
@@ -37,7 +40,7 @@ def test_an_example_fits_on_a_screen_and_says_how_to_run_it(path: Path) -> None:
 
 @pytest.mark.parametrize("name", sorted(SAYS))
 def test_an_example_runs(name: str, tmp_path: Path) -> None:
-    if name in ("foreign_env", "gym_env", "own_vector_env"):
+    if name in ("foreign_env", "foreign_robosuite", "gym_env", "own_vector_env"):
         pytest.importorskip("gymnasium")
     command = [sys.executable, str(ROOT / "examples" / f"{name}.py")]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}

@@ -45,6 +45,7 @@ def test_every_key_comes_out_in_si(tmp_path: Path) -> None:
     resolution = [160, 120]
     pitch_mm = 0.2
     variants = 3
+    frames_per_stage = 12
     [press]
     depth_mm = [0.2, 1]
     x_mm = [-1, 2]
@@ -65,6 +66,7 @@ def test_every_key_comes_out_in_si(tmp_path: Path) -> None:
     assert [s.name for s in sweep.objects] == ["ball", "coin"] and sweep.objects[0].object.params["radius"] == 3e-3
     assert (sweep.count, sweep.shard_size, sweep.seed, sweep.variants) == (50, 10, 7, 3)
     assert (sweep.physics, sweep.pad, sweep.optics, sweep.markers) == ("ipc", "medium", "raytrace", "surface")
+    assert sweep.frames_per_stage == 12
     assert sweep.outputs == ("rgb", "traction") and sweep.resolution == (160, 120) and sweep.pitch == 0.2e-3
     ranges = sweep.ranges
     assert ranges.depth == (0.2e-3, 1e-3) and ranges.x == (-1e-3, 2e-3) and ranges.y == (0.0, 0.0)
