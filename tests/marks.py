@@ -76,6 +76,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "physics/test_soft.py",
         "physics/test_soft_batch.py",
         "physics/test_soft_forces.py",
+        "physics/test_soft_locking.py",
         "physics/test_soft_objects.py",
         "physics/test_soft_scene.py",
         "physics/test_soft_sleep.py",

@@ -35,24 +35,20 @@ OUTSIDE = {
 """Pages of the site that stand for files of the repository."""
 EXAMPLES = "examples.md"
 LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\[\]]*\])*)\]\(([^)\s]+)\)")
-BULLET = re.compile(r"^│\s+• ([a-z][a-z-]*)(?:\s|│)", re.MULTILINE)
+COMMAND = re.compile(r"^  ([a-z][a-z-]*)  ", re.MULTILINE)
 
 
-def commands(*path: str) -> dict[str, str]:
-    """Help text of the command ``path`` and of all below it, by its words."""
+def help_text(*command: str) -> str:
+    """Help of ``raytac``, or of one of its commands."""
     environment = {**os.environ, "COLUMNS": "88", "NO_COLOR": "1", "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path])}
-    call = [sys.executable, "-m", "raytac", *path, "--help"]
+    call = [sys.executable, "-m", "raytac", *command, "--help"]
     text = subprocess.run(call, capture_output=True, text=True, check=True, env=environment, cwd=ROOT).stdout
-    result = {" ".join(path): re.sub(r"\x1b\[[0-9;]*m", "", text).strip()}
-    for name in BULLET.findall(text):
-        result |= commands(*path, name)
-    return result
+    return re.sub(r"\x1b\[[0-9;]*m", "", text).strip()
 
 
 def command_line() -> str:
     """Markdown of all commands with their options."""
-    texts = commands()
-    return "\n\n".join(f"## raytac {words}\n\n```text\n{text}\n```" for words, text in texts.items() if words)
+    return "\n\n".join(f"## raytac {name}\n\n```text\n{help_text(name)}\n```" for name in COMMAND.findall(help_text()))
 
 
 def packages() -> dict[str, dict[str, str]]:
