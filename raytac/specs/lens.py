@@ -1,6 +1,7 @@
-"""Lens and aim of a camera: from the image to rays in the pad frame and back, the same in every optical mode.
+"""Lens and aim of a camera: from the image to rays in the pad frame and back.
 
-Distortion is that of Brown and Conrady, with the coefficients of OpenCV. With r² = x² + y² of undistorted coordinates x = X/Z, y = Y/Z
+It is the same in every optical mode. Distortion is that of Brown and Conrady, with the coefficients of OpenCV. With r² = x² + y² of
+undistorted coordinates x = X/Z, y = Y/Z
 
     x_d = x (1 + k1 r² + k2 r⁴) + 2 p1 x y + p2 (r² + 2x²)
     y_d = y (1 + k1 r² + k2 r⁴) + p1 (r² + 2y²) + 2 p2 x y
