@@ -229,7 +229,7 @@ def draw(path: Path, photographs: np.ndarray, renders: np.ndarray, rest: np.ndar
             for axis, image in zip(line, images, strict=True):
                 axis.imshow(np.clip(image, 0, 255).astype(np.uint8))
                 axis.set(xticks=[], yticks=[])
-        figure.savefig(path, dpi=110)
+        figure.savefig(path, dpi=66)
         plt.close(figure)
 
 

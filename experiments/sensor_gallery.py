@@ -23,13 +23,13 @@ from raytac.specs import CameraSpec, load_press
 
 SENSORS = {
     "gelsight_mini": "GelSight Mini",
-    "gelsight_dome": "older GelSight, domed",
+    "gelsight_dome": "domed GelSight",
     "digit": "DIGIT",
     "gelsight_r15": "GelSight R1.5-like",
 }
 OBJECTS = {"sphere": "sphere", "coin": "coin", "pins": "pins", "cone": "cone", "mesh": "gear"}
 REST = "at rest"
-DPI = 100
+DPI = 86
 
 
 @dataclass(frozen=True, kw_only=True)
