@@ -50,6 +50,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "test_doctor.py",
         "test_press_end_to_end.py",
         "test_render.py",
+        "test_shipped_sensors.py",
         "view/test_view_command.py",
     ),
     "solver": (
@@ -88,6 +89,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "report/test_press_store.py",
         "report/test_preview.py",
         "robots",
+        "test_shipped_sensors.py",
         "test_arguments.py",
         "test_device.py",
         "test_fuzz_inputs.py",

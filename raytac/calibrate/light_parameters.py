@@ -229,11 +229,15 @@ def leds_inside(sensor: SensorSpec, p: LightParameters, *, lengths: np.ndarray, 
     leds[:, 4], leds[:, 5] = np.clip(leds[:, 4], -1.4, 1.4), np.clip(leds[:, 5], 1.0, 15.0)
     leds[:, HEIGHT] = np.where(heights, np.clip(leds[:, HEIGHT], *HEIGHTS), leds[:, HEIGHT])
     u, v = _edges(leds)
-    room = 1e3 * np.array(sensor.case.size) - 2 * GAP - leds[:, HEIGHT, None] * np.abs(v[:, :2])
+    low, high = _beside_view(sensor, p)
+    # What lies between a wall and the view is as wide for a virtual source as the case for an LED.
+    width = np.where(p.virtual[:, None], high - low, 1e3 * np.array(sensor.case.size))
+    tallest = ((width - 2 * GAP - SHORTEST * np.abs(u[:, :2])) / np.maximum(np.abs(v[:, :2]), 1e-6)).min(1)
+    leds[:, HEIGHT] = np.where(heights & p.virtual, np.clip(leds[:, HEIGHT], None, tallest), leds[:, HEIGHT])
+    room = width - 2 * GAP - leds[:, HEIGHT, None] * np.abs(v[:, :2])
     longest = np.maximum((room / np.maximum(np.abs(u[:, :2]), 1e-6)).min(1), SHORTEST)
     leds[:, LENGTH] = np.where(lengths, np.clip(leds[:, LENGTH], SHORTEST, longest), leds[:, LENGTH])
     reach = GAP + 0.5 * (leds[:, LENGTH, None] * np.abs(u) + leds[:, HEIGHT, None] * np.abs(v))
-    low, high = _beside_view(sensor, p)
     leds[:, :2] = np.clip(leds[:, :2], reach[:, :2] + low, np.maximum(high - reach[:, :2], reach[:, :2] + low))
     pad, ceiling = sensor.gelpad, np.full(len(leds), CEILING)
     for k in np.flatnonzero(p.virtual):

@@ -147,12 +147,16 @@ def fit_lights(
 
     ``start``: where the fit begins; None is ``first_state``. ``rounds`` of defect correction follow the fit of direct light; 0 leaves it
     at that. Direct light is fitted from ``starts`` places, the given one and others about it, and the best goes on. ``seed`` chooses
-    pixels and places. ``tick`` is called with the stage and the cost after every step. Raises InputError: refraction, LEDs of no colour,
-    or fewer values than parameters; BackendError: the ray tracer cannot run on ``device``.
+    pixels and places. ``tick`` is called with the stage and the cost after every step. Raises InputError: refraction, a camera with
+    distortion, tilt or without colours, LEDs of no colour, or fewer values than parameters; BackendError: the ray tracer cannot run on
+    ``device``.
     """
     settings = FitSettings() if settings is None else settings
     if sensor.refraction.model != "none":
         raise InputError("refraction.model", value=sensor.refraction.model, rule="cannot be fitted", choices=("none",))
+    if not sensor.camera.lens.is_plain or sensor.camera.monochrome:
+        rule = "must have no distortion, tilt or monochrome camera: fits know a pinhole of three colours that looks along +z"
+        raise InputError("sensor.camera", value=sensor.name, rule=rule)
     begin = start or first_state(sensor, shots, settings, seed)
     problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, seed=seed)
     unknown, known = len(problem.flat(begin)) + 3 * len(shots.circles), 3 * len(problem.press)

@@ -42,7 +42,7 @@ def probe_sensor(sensor: SensorSpec) -> SensorSpec:
     for axis in range(2):
         pitch, count, principal = camera.pixel_pitch[axis], camera.resolution[axis], camera.principal_point[axis]
         sizes.append(1 + int((pitch * count - 2 * _MARGIN) / PROBE_PITCH))
-        centre.append(camera.position[axis] + (count / 2 - principal) * pitch)
+        centre.append(camera.centre[axis] + (count / 2 - principal) * pitch)
     spec = MarkerSpec(sizes[1], sizes[0], (PROBE_PITCH, PROBE_PITCH), (centre[0], centre[1]), 0.2e-3, 0.0)
     return replace(sensor, markers=spec)
 

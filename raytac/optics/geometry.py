@@ -115,6 +115,13 @@ class CoatField:
         self.pad_deepest = dr.block_reduce(dr.ReduceOp.Max, self.deepest, layout.tiles_x * layout.tiles_y)
         dr.eval(self.lowest, self.highest, self.deepest, self.pad_deepest)
 
+    def _pad_bounds(self) -> tuple[Any, Any]:
+        """Lowest and highest z of every pad [m], (B,) each."""
+        tiles = self.layout.tiles_x * self.layout.tiles_y
+        bounds = dr.block_reduce(dr.ReduceOp.Min, self.lowest, tiles), dr.block_reduce(dr.ReduceOp.Max, self.highest, tiles)
+        dr.eval(*bounds)
+        return bounds
+
     @staticmethod
     def memory_per_env(layout: CoatLayout) -> int:
         """Bytes of one surface: normals and corners of every node, and the tiles' bounds."""
@@ -141,16 +148,19 @@ class CoatField:
         ty = dr.minimum(mi.UInt32(dr.clip((y - g.y0) / g.dy, 0, g.ny - 1.001)) // g.tile_y, g.tiles_y - 1)
         return (env * g.tiles_y + ty) * g.tiles_x + tx
 
-    def camera_hit(self, env: Any, origin: tuple[Any, Any, Any], tx: Any, ty: Any) -> Any:
+    def camera_hit(self, env: Any, origin: tuple[Any, Any, Any], tx: Any, ty: Any, *, oblique: bool = False) -> Any:
         """First point of the ray origin + s (tx, ty, 1) on the surface; origins may differ by pixel.
 
-        The tile's bounds bracket the hit; the bracket is walked in steps of one cell until the ray is behind the surface, then
-        refined by the secant rule (bilinear patches are nearly linear along so short a way).
+        The tile's bounds bracket the hit, or those of the whole pad for rays too ``oblique`` to stay over a tile; the bracket is walked
+        in steps of one cell until the ray is behind the surface, then refined by the secant rule (bilinear patches are nearly linear along
+        so short a way).
         """
         mi, g = self.mi, self.layout
         ox, oy, oz = origin
         tile = self.tile(env, ox + (LOOK_UP_Z - oz) * tx, oy + (LOOK_UP_Z - oz) * ty)
         lo, hi = dr.gather(mi.Float, self.lowest, tile), dr.gather(mi.Float, self.highest, tile)
+        if oblique:
+            lo, hi = (dr.gather(mi.Float, bound, env) for bound in self._pad_bounds())
         lo, hi = lo - 1e-6, hi + 1e-6
         steps = dr.ceil((hi - lo) * dr.sqrt(tx * tx + ty * ty) / min(g.dx, g.dy)) + 1
         dz = (hi - lo) / steps
@@ -291,7 +301,7 @@ def see(mi: Any, field: CoatField, camera: Pinhole, envs: int, jitter: tuple[flo
     column, row = camera.pixel(i - env * (width * height))
     u, v = mi.Float(column) + jitter[0], mi.Float(row) + jitter[1]
     origin, (tx, ty) = camera.ray(u, v)
-    p = field.camera_hit(env, origin, tx, ty)
+    p = field.camera_hit(env, origin, tx, ty, oblique=camera.lens.tilts)
     n = field.normal(env, p.x, p.y)
     exit = None
     if camera.slab is not None:
@@ -312,7 +322,7 @@ def seen_images(p: Any, n: Any, surface: GelSurface, camera: Pinhole, outputs: S
         images["normals"] = np.ascontiguousarray(np.array(n).T.reshape(*shape, 3))
         images["position"] = np.ascontiguousarray(points)
     if "depth" in outputs:
-        images["depth"] = (points[..., 2] - camera.position[2]).astype(np.float32)
+        images["depth"] = camera.depth(points).astype(np.float32)
     return images
 
 
@@ -321,9 +331,20 @@ def check_view(camera: Pinhole, grid: PadGrid) -> None:
     # A slab bends oblique rays more, so a side of the image reaches farthest where it is closest to the optical axis.
     width, height = camera.resolution
     cx, cy = camera.principal
+    if not camera.lens.is_plain:  # sides of the image are curved, or oblique, on the plane
+        along = np.linspace(0, 1, _RAYS)
+        u = width * np.concatenate([along, along, 0 * along, 0 * along + 1])
+        v = height * np.concatenate([0 * along, 0 * along + 1, along, along])
+        origin, slope = camera.ray(u, v)
+        _check_extent([origin[k] - slope[k] * origin[2] for k in (0, 1)], grid)
+        return
     views = camera.ray(np.array([0.0, width]), cy), camera.ray(cx, np.array([0.0, height]))
-    for k, (axis, nodes, (origin, slope)) in enumerate(zip("xy", (grid.x, grid.y), views, strict=True)):
-        seen = origin[k] - slope[k] * origin[2]
-        if seen[0] < nodes[0] - 1e-6 or seen[1] > nodes[-1] + 1e-6:
-            rule = f"the camera sees {axis} from {1e3 * seen[0]:.2f} to {1e3 * seen[1]:.2f} mm, beyond the pad's edge"
+    _check_extent([origin[k] - slope[k] * origin[2] for k, (origin, slope) in enumerate(views)], grid)
+
+
+def _check_extent(seen: Sequence[np.ndarray], grid: PadGrid) -> None:
+    """Raise InputError if x or y [m] of ``seen`` lie beyond the grid."""
+    for axis, nodes, at in zip("xy", (grid.x, grid.y), seen, strict=True):
+        if at.min() < nodes[0] - 1e-6 or at.max() > nodes[-1] + 1e-6:
+            rule = f"the camera sees {axis} from {1e3 * at.min():.2f} to {1e3 * at.max():.2f} mm, beyond the pad's edge"
             raise InputError(f"grid.{axis}", value=(float(nodes[0]), float(nodes[-1])), rule=rule)

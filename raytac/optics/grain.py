@@ -21,6 +21,8 @@ def check_grain(sensor: SensorSpec) -> NoiseSpec:
 class Grain:
     """Noise of a sensor's pixels, as ``NoiseSpec`` says, for images of one resolution.
 
+    A monochrome camera has that of the first channel in all three.
+
     A pixel of an image with fewer pixels than the camera's is the mean of several, so its variance is smaller by their number. Draws of
     an environment do not depend on how many there are.
     """
@@ -33,6 +35,7 @@ class Grain:
         dark, bright = np.array(noise.dark_variance), np.array(noise.bright_variance)
         self.sigma = np.sqrt(share * (dark + (bright - dark) * level)).astype(np.float32)
         """Standard deviation [levels] by 8-bit level and channel, (256, 3)."""
+        self._drawn = 1 if sensor.camera.monochrome else 3
         self._streams = [np.random.default_rng((seed, env, 0x6A1)) for env in range(batch)]
 
     def reseed(self, env: int, seed: int) -> None:
@@ -49,7 +52,7 @@ class Grain:
         """8-bit images (n, H, W, 3) with the grain of ``seeds``, rounded and cut at 0 and 255."""
         result = np.empty_like(images)
         for k, seed in enumerate(seeds):
-            drawn = np.random.default_rng(seed).standard_normal(images.shape[1:], np.float32)
-            drawn *= self.sigma[images[k], np.arange(3)]
+            drawn = np.random.default_rng(seed).standard_normal((*images.shape[1:3], self._drawn), np.float32)
+            drawn = drawn * self.sigma[images[k], np.minimum(np.arange(3), self._drawn - 1)]
             result[k] = np.clip(np.rint(images[k] + drawn), 0, 255).astype(np.uint8)
         return result

@@ -21,10 +21,13 @@ _STEPS = 60
 
 
 class Response:
-    """u8 = 255 · clip(white balance · exposure · vignette · shading · L + black)^(1/γ), rounded."""
+    """u8 = 255 · clip(white balance · exposure · vignette · shading · L + black)^(1/γ), rounded.
 
-    def __init__(self, spec: ResponseSpec, camera: Pinhole) -> None:
-        self.spec = spec
+    With ``monochrome`` what is clipped is the mean over channels, and all three show it.
+    """
+
+    def __init__(self, spec: ResponseSpec, camera: Pinhole, *, monochrome: bool = False) -> None:
+        self.spec, self.monochrome = spec, monochrome
         width, height = camera.resolution
         u, v = np.meshgrid(np.arange(width) + 0.5 - camera.principal[0], np.arange(height) + 0.5 - camera.principal[1])
         r2 = (u**2 + v**2) / ((width**2 + height**2) / 4)
@@ -42,6 +45,9 @@ class Response:
             rule = f"{dark} of {at_rest.size} values rendered at rest are dark, so no gain makes them bright"
             raise InputError("flat_field", value=background.shape, rule=rule)
         target = (background.astype(np.float32) / 255) ** self.spec.gamma - self.black
+        if self.monochrome:  # one gain of the mean, so that channels keep their weights
+            self.scale = (self.scale * _grey(target) / _grey(at_rest * self.scale)).astype(np.float32)
+            return
         self.scale = (target / at_rest).astype(np.float32)
 
     def encode(self, mi: Any, linear: list[Any], scale: list[Any]) -> Any:
@@ -49,10 +55,10 @@ class Response:
         n = dr.width(linear[0])
         i = dr.arange(mi.UInt32, n)
         pixel = i % dr.width(scale[0])
-        out = []
-        for c in range(3):
-            value = linear[c] * dr.gather(mi.Float, scale[c], pixel) + float(self.black[c])
-            out.append(dr.power(dr.clip(value, 0, 1), 1 / self.spec.gamma) * 255 + 0.5)
+        values = [linear[c] * dr.gather(mi.Float, scale[c], pixel) + float(self.black[c]) for c in range(3)]
+        if self.monochrome:
+            values = [(values[0] + values[1] + values[2]) / 3] * 3
+        out = [dr.power(dr.clip(value, 0, 1), 1 / self.spec.gamma) * 255 + 0.5 for value in values]
         # One kernel for the whole image; the interleaving one would otherwise trace it once a channel.
         dr.eval(out)
         return mi.UInt8(dr.ravel(mi.Color3f(*out)))
@@ -65,7 +71,14 @@ class Response:
     def encode_numpy(self, linear: np.ndarray) -> np.ndarray:
         """8-bit image (…, H, W, 3) of linear radiance of that shape."""
         value = linear * self.scale + self.black
+        if self.monochrome:
+            value = np.broadcast_to(_grey(value), value.shape)
         return (np.clip(value, 0, 1) ** (1 / self.spec.gamma) * 255 + 0.5).astype(np.uint8)
+
+
+def _grey(values: np.ndarray) -> np.ndarray:
+    """Mean over the last axis, which is kept."""
+    return values.mean(axis=-1, keepdims=True)
 
 
 def mid_grey_exposure(sensor: SensorSpec, signal: np.ndarray) -> float:
@@ -80,6 +93,8 @@ def mid_grey_exposure(sensor: SensorSpec, signal: np.ndarray) -> float:
     Raises SpecError: no exposure makes mid-grey, since half of the image or more is dark, or since the black level alone is brighter.
     """
     black, gamma = np.asarray(sensor.response.black_level), sensor.response.gamma
+    if sensor.camera.monochrome:
+        signal, black = _grey(signal), _grey(black)
 
     def brightness(exposure: float) -> float:
         return float((np.clip(exposure * signal + black, 0, 1) ** (1 / gamma)).mean(axis=(0, 1)).max())

@@ -16,5 +16,7 @@ from .measure import wilson_interval as wilson_interval
 from .press import press_peaks as press_peaks
 from .press import run_press as run_press
 from .preview import camera_extent_mm as camera_extent_mm
+from .real_scores import press_scores as press_scores
+from .real_scores import summary as summary
 from .tracers import Tracers as Tracers
 from .tracers import path_trace as path_trace

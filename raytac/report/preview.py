@@ -80,9 +80,12 @@ _Panel = Callable[[Axes, PreviewData], None]
 
 
 def camera_extent_mm(camera: CameraSpec) -> tuple[float, float, float, float]:
-    """Left, right, bottom, top edge of the whole image on the plane z = 0 [mm]."""
+    """Left, right, bottom, top edge of the whole image on the plane z = 0 [mm].
+
+    Of a camera with distortion or tilt it is the extent that it would have without, about its optical axis.
+    """
     (width, height), (px, py), (cx, cy) = camera.resolution, camera.pixel_pitch, camera.principal_point
-    x, y = camera.position[:2]
+    x, y = camera.centre
     return tuple(1e3 * v for v in (x - cx * px, x + (width - cx) * px, y + (height - cy) * py, y - cy * py))  # type: ignore[return-value]
 
 

@@ -17,12 +17,16 @@ from .sensor import GelpadSpec as GelpadSpec
 from .sensor import LedSpec as LedSpec
 from .sensor import LightsSpec as LightsSpec
 from .sensor import MarkerSpec as MarkerSpec
+from .sensor import NoiseSpec as NoiseSpec
+from .sensor import OpticsSpec as OpticsSpec
 from .sensor import RefractionSpec as RefractionSpec
 from .sensor import ResponseSpec as ResponseSpec
 from .sensor import SensorSpec as SensorSpec
 from .sensor_check import validate_sensor as validate_sensor
+from .sensor_file import lights_text as lights_text
 from .sensor_file import load_lights as load_lights
 from .sensor_file import load_sensor as load_sensor
+from .sensor_file import sensor_files as sensor_files
 from .sensor_file import with_lights as with_lights
 from .sweep import PressRanges as PressRanges
 from .sweep import SweepSpec as SweepSpec

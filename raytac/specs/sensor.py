@@ -11,7 +11,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
+import numpy as np
+
 from raytac.errors import SpecError
+from raytac.specs.lens import Lens
 from raytac.specs.marker_motion import MarkerMotionSpec
 from raytac.specs.toml import ANY, Flag, Integer, Number, Schema, Text, check_fields
 
@@ -57,6 +60,9 @@ SENSOR_SCHEMA: Final[dict[str, Schema]] = {
         "pixel_pitch_mm": Number("[0.0005, 5]", length=2),
         "position_mm": Number("[-500, 500]", length=3),
         "principal_point_px": Number("[-8192, 16384]", length=2),
+        "distortion": Number("[-2, 2]", length=4, default=(0.0, 0.0, 0.0, 0.0)),
+        "tilt_deg": Number("[-60, 60]", length=3, default=(0.0, 0.0, 0.0)),
+        "monochrome": Flag(default=False),
     },
     "response": {
         "exposure": Number("(0, 1e9]", word=AUTO),
@@ -180,19 +186,54 @@ class CaseSpec:
 
 @dataclass(frozen=True)
 class CameraSpec:
-    """A pinhole looking along +z, given by the pixel pitch on the gel plane z = 0."""
+    """A camera looking along +z unless tilted, given by the pixel pitch on the gel plane z = 0."""
 
     resolution: tuple[int, int]
     """Native (width, height) [px] of the image that the specification describes."""
     pixel_pitch: Vec2
-    """Size of one native pixel on the plane z = 0 along x and y [m]."""
+    """Size of one native pixel on the plane z = 0 along x and y [m].
+    It holds where the optical axis meets the plane; of a tilted camera, across that axis."""
     position: Vec3
     """Pinhole (centre of projection), pad frame [m]; z < 0. The image centre looks along +z."""
     principal_point: Vec2
     """Pixel, in native pixels from the top-left image corner, that the optical axis meets [px]."""
+    distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2 of Brown and Conrady's model, as OpenCV has them (``Lens``)."""
+    tilt: Vec3 = (0.0, 0.0, 0.0)
+    """Rotation vector [rad], pad frame, that turns the camera from looking along +z."""
+    monochrome: bool = False
+    """True for a camera without colours: all channels show the mean of their linear signals."""
 
     def __post_init__(self) -> None:
         check_fields(vars(self), SENSOR_SCHEMA["camera"], "camera")
+
+    @property
+    def lens(self) -> Lens:
+        """Distortion and tilt."""
+        return Lens(self.distortion, self.tilt)
+
+    @property
+    def centre(self) -> Vec2:
+        """x, y [m] where the optical axis meets the plane z = 0."""
+        x, y, z = self.position
+        if not self.lens.tilts:
+            return x, y
+        a, b, c = self.lens.axis
+        return x - z * a / c, y - z * b / c
+
+    @property
+    def focal(self) -> Vec2:
+        """Focal lengths along x and y [px]: distance to z = 0 on the axis over the pitch."""
+        distance = -self.position[2] / self.lens.axis[2]
+        return distance / self.pixel_pitch[0], distance / self.pixel_pitch[1]
+
+    def border(self, count: int = 33) -> tuple[Any, Any]:
+        """Slopes (dx/dz, dy/dz) of ``count`` rays along each side of the image, (4·count,) each."""
+        (width, height), (cx, cy), (fx, fy) = self.resolution, self.principal_point, self.focal
+        along = np.linspace(0, 1, count)
+        u = width * np.concatenate([along, along, 0 * along, 0 * along + 1])
+        v = height * np.concatenate([0 * along, 0 * along + 1, along, along])
+        return self.lens.slope((u - cx) / fx, (v - cy) / fy)
 
     def pitch_at(self, resolution: tuple[int, int]) -> Vec2:
         """Size along x and y [m] of a pixel on z = 0 at a ``resolution`` (width, height) [px]."""

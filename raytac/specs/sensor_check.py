@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from raytac.errors import SpecError
+from raytac.specs.lens import Lens
 from raytac.specs.sensor import LedSpec, SensorSpec, Vec3, shading_degree
 from raytac.specs.toml import in_mm
 
@@ -12,6 +15,10 @@ _COEFFICIENT = 5.0
 """Most that a coefficient of a colour shading may be, as in the file."""
 _LOG_GAIN = 20.0
 """Most that the logarithm of a colour shading's gain may be."""
+_STEEPEST = 1.2
+"""Largest slope to the pad's z of a ray in the view of a tilted camera: 50 degrees."""
+_LENS_ERROR = 1e-3
+"""Most [px] that a pixel may be off after its distortion is taken off and put on again."""
 _SLACK = 1e-9
 """Tolerance of geometric comparisons [m]: a part may touch the case or the gel."""
 
@@ -22,10 +29,11 @@ def validate_sensor(sensor: SensorSpec) -> None:
     Files and every specification of a ``TactileSensor`` or a world go through it.
 
     Raises:
-        SpecError: the dome is deeper than the pad; the camera lies in the gel, outside the case, or sees past the pad; the
-            vignette leaves no light; colour shading has a wrong number of coefficients or might overflow; markers lie off the pad; an
-            LED lies in the gel, above the dome, or outside the case, a virtual one above the dome, in the camera's view or where
-            light refracts; with ``refraction.model = "slab"``, camera or LED do not lie below the slab's face to the air.
+        SpecError: the dome is deeper than the pad; the camera lies in the gel, outside the case, or sees past the pad; its
+            distortion has no inverse, or its tilt is too large; the vignette leaves no light; colour shading has a wrong number of
+            coefficients or might overflow; markers lie off the pad; an LED lies in the gel, above the dome, or outside the case, a
+            virtual one above the dome, in the camera's view or where light refracts; with ``refraction.model = "slab"``, camera or LED do
+            not lie below the slab's face to the air.
             The message names the file that the sensor or its lights came from, the key, and the value in the unit of the file.
     """
     _check_dome(sensor)
@@ -80,6 +88,10 @@ def _check_camera(sensor: SensorSpec) -> None:
     if not _in_case(sensor, camera.position):
         rule = f"the camera must lie inside the case, {_case_rule(sensor)}"
         raise _error(sensor, "camera.position_mm", in_mm(camera.position), rule)
+    _check_lens(sensor)
+    if not camera.lens.is_plain:
+        _check_view(sensor)
+        return
     view = tuple(n * pitch for n, pitch in zip(camera.resolution, camera.pixel_pitch, strict=True))
     centre = tuple(
         at + (n / 2 - principal) * pitch
@@ -95,13 +107,40 @@ def _check_camera(sensor: SensorSpec) -> None:
     _check_view(sensor)
 
 
+def _check_lens(sensor: SensorSpec) -> None:
+    """Check that distortion has an inverse over the image, and that tilt is not too large."""
+    camera, lens = sensor.camera, sensor.camera.lens
+    if lens.tilts:
+        if sensor.refraction.model == "slab":
+            rule = (
+                "must be [0, 0, 0] with refraction.model = 'slab': the pixel pitch of a tilted camera is not defined behind one"
+            )
+            raise _error(sensor, "camera.tilt_deg", [math.degrees(angle) for angle in camera.tilt], rule)
+        if lens.axis[2] < 0.5:
+            rule = f"turns the camera by {math.degrees(math.acos(lens.axis[2])):.4g} degrees from +z: must be at most 60"
+            raise _error(sensor, "camera.tilt_deg", [math.degrees(angle) for angle in camera.tilt], rule)
+    if lens.distorts:
+        (width, height), (cx, cy), (fx, fy) = camera.resolution, camera.principal_point, camera.focal
+        x, y = np.meshgrid((np.linspace(0, width, 33) - cx) / fx, (np.linspace(0, height, 33) - cy) / fy)
+        flat = Lens(camera.distortion)
+        with np.errstate(all="ignore"):
+            ideal = flat.slope(x, y)
+            back, area = flat.image(*ideal), flat.determinant(*ideal)
+            off = np.hypot(fx * (back[0] - x), fy * (back[1] - y))
+        if not (off.max() <= _LENS_ERROR and area.min() > 0):
+            rule = "must have an inverse over the whole image: these coefficients fold it"
+            raise _error(sensor, "camera.distortion", list(camera.distortion), rule)
+    if lens.tilts and (steepest := float(np.hypot(*camera.border()).max())) > _STEEPEST:
+        rule = f"the steepest ray has a slope of {steepest:.3g} to the pad's z: must be at most {_STEEPEST:g}"
+        raise _error(sensor, "camera.tilt_deg", [math.degrees(angle) for angle in camera.tilt], rule)
+
+
 def _check_view(sensor: SensorSpec) -> None:
     """The outermost pixels see the pad: x = position_x + (u − cx) · pitch at z = 0, y alike."""
     pad, camera = sensor.gelpad, sensor.camera
-    for axis, name in enumerate("xy"):
+    for axis, (name, (low, high)) in enumerate(zip("xy", view_edges(sensor), strict=True)):
         at, principal = camera.position[axis], camera.principal_point[axis]
         pixels, pitch = camera.resolution[axis], camera.pixel_pitch[axis]
-        low, high = at - principal * pitch, at + (pixels - principal) * pitch
         half = pad.size[axis] / 2
         if low < -half - _SLACK or high > half + _SLACK:
             rule = (
@@ -193,6 +232,12 @@ def _check_led(sensor: SensorSpec, index: int, led: LedSpec) -> None:
 def view_edges(sensor: SensorSpec) -> tuple[tuple[float, float], tuple[float, float]]:
     """Lowest and highest x, then y, of the camera's view of z = 0 [m]; below it is narrower."""
     camera = sensor.camera
+    if not camera.lens.is_plain:
+        slopes, depth = camera.border(), -camera.position[2]
+        x, y = (
+            (at + depth * float(s.min()), at + depth * float(s.max())) for at, s in zip(camera.position, slopes, strict=False)
+        )
+        return x, y
     x, y = (
         (at - principal * pitch, at + (count - principal) * pitch)
         for at, principal, pitch, count in zip(

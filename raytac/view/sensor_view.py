@@ -167,10 +167,11 @@ def sensor_lines(spec: SensorSpec) -> tuple[Lines, ...]:
     (wide, long), gel = spec.case.size, spec.gelpad
     case = _box_edges((-0.5 * wide, -0.5 * long, spec.case.floor_z), (0.5 * wide, 0.5 * long, -gel.thickness))
     camera = spec.camera
-    (width, height), (px, py), (cx, cy) = camera.resolution, camera.pixel_pitch, camera.principal_point
+    (width, height), (cx, cy), (fx, fy) = camera.resolution, camera.principal_point, camera.focal
     eye = np.asarray(camera.position)
     corners = np.array([(0, 0), (width, 0), (width, height), (0, height)], float)
-    seen = np.column_stack([eye[0] + (corners[:, 0] - cx) * px, eye[1] + (corners[:, 1] - cy) * py, np.zeros(4)])
+    slope_x, slope_y = camera.lens.slope((corners[:, 0] - cx) / fx, (corners[:, 1] - cy) / fy)
+    seen = np.column_stack([eye[0] - eye[2] * slope_x, eye[1] - eye[2] * slope_y, np.zeros(4)])
     rays = [np.stack([np.broadcast_to(eye, (4, 3)), seen], axis=1), np.stack([seen, np.roll(seen, -1, axis=0)], axis=1)]
     return Lines("case", case, _CASE), Lines("camera_view", np.concatenate(rays), _VIEW)
 

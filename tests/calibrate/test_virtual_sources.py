@@ -10,7 +10,7 @@ import pytest
 
 from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
 from raytac.calibrate.direct_light import ExtraLight, Light
-from raytac.calibrate.light_parameters import CEILING, VIRTUAL_CEILING
+from raytac.calibrate.light_parameters import CEILING, VIRTUAL_CEILING, LightParameters, leds_inside
 from raytac.calibrate.ray_fit import fit_lights, solve_direct
 from raytac.calibrate.start import leds_at_walls, leds_in_rows
 from raytac.errors import InputError, SpecError
@@ -38,6 +38,22 @@ def moved_to(sensor: SensorSpec, z: float, virtual: bool = True) -> SensorSpec:
     """All LEDs at the height z [mm], beside the view."""
     leds = (dataclasses.replace(led, position=(*led.position[:2], z / 1e3), virtual=virtual) for led in sensor.lights.leds)
     return dataclasses.replace(sensor, lights=LightsSpec(tuple(leds)))
+
+
+def test_long_sources_are_cut_to_what_lies_between_wall_and_view(mini: SensorSpec) -> None:
+    """However a source is turned and however large it grows, the sensor accepts what its bounds leave of it."""
+    camera = dataclasses.replace(mini.camera, pixel_pitch=(6.8e-5, 6.8e-5))
+    wide = moved_to(dataclasses.replace(mini, camera=camera), -4.0)
+    p = LightParameters.of(wide, np.full((240, 320, 3), 100.0))
+    rng = np.random.default_rng(5)
+    for _ in range(50):
+        leds = p.leds.copy()
+        leds[:, 3:5] = rng.uniform([-np.pi, -1.4], [np.pi, 1.4], (3, 2))
+        leds[:, 6:8] = rng.uniform([0.1, 0.1], [9.0, 30.0], (3, 2))
+        every = np.ones(3, bool)
+        own = dataclasses.replace(p, leds=leds)
+        moved = dataclasses.replace(own, leds=leds_inside(wide, own, lengths=every, heights=every))
+        validate_sensor(dataclasses.replace(wide, lights=moved.lights(wide)))
 
 
 @pytest.mark.parametrize("z", [-1.5, -3.0, -8.0, -18.0])

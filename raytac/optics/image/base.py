@@ -135,6 +135,11 @@ def see_heights(
     return ImageHeights(height, displacement, touched, envs, camera.resolution, pitch[0] / pitch[1], dots, camera.crop)
 
 
+def grey_levels(channels: list[Any]) -> list[Any]:
+    """The mean of three channels in each: what a monochrome camera makes of a model of colours."""
+    return [(channels[0] + channels[1] + channels[2]) / 3] * 3
+
+
 class ImageMode(DeviceMode):
     """Base of the modes that shade height images, by ``_levels`` and ``_floats_per_pixel``."""
 
@@ -169,7 +174,9 @@ class ImageMode(DeviceMode):
     def _inked_levels(self, seen: ImageHeights, inputs: FrameInputs) -> tuple[list[Float], UInt8]:
         """``_levels`` with the dots of the markers, if there are some."""
         channels, flags = self._levels(seen, inputs.own)
-        return (channels if seen.ink is None else darkened(self.sensor, channels, seen.here(self.mi, seen.ink))), flags
+        if seen.ink is not None:
+            channels = darkened(self.sensor, channels, seen.here(self.mi, seen.ink))
+        return (grey_levels(channels) if self.sensor.camera.monochrome else channels), flags
 
     def _see(self, heights: Float, contact: UInt8 | None, inputs: FrameInputs) -> ImageHeights:
         seen = see_heights(self.mi, self.layout, self.camera, self.pitch, inputs.rest, heights, contact, inputs.ink)

@@ -12,7 +12,7 @@ from raytac.optics.device_mode import Float, UInt8
 from raytac.optics.image.base import ImageHeights, ImageMode
 from raytac.optics.image.config import Mlp
 from raytac.optics.image.mlp_weights import LEVELS, MlpWeights, forward, inputs, load_mlp, view_slope
-from raytac.optics.image.network_files import check_view
+from raytac.optics.image.network_files import check_straight, check_view
 from raytac.optics.taxim.mode import padded, resized
 
 
@@ -28,6 +28,7 @@ class MlpMode(ImageMode):
         weights = self.config.weights
         assert weights is not None
         self.weights = weights if isinstance(weights, MlpWeights) else load_mlp(weights)
+        check_straight("mlp", self.sensor)
         check_view("mlp", self.sensor, self.weights.view, self.weights.provenance)
         self._view = view_slope(self.sensor)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +25,28 @@ def view_size(sensor: SensorSpec) -> tuple[float, float]:
 
 
 def look_digest(sensor: SensorSpec) -> str:
-    """Digest of a sensor's lights, coat, case, camera and response: all that shapes its image."""
-    look = (sensor.lights, sensor.coat, sensor.case, sensor.camera, sensor.response, sensor.optics)
-    return hashlib.sha256(repr(look).encode()).hexdigest()[:16]
+    """Digest of a sensor's lights, coat, case, camera and response: all that shapes its image.
+
+    Where its files lie does not.
+    """
+    camera, lights = sensor.camera, replace(sensor.lights, source=None)
+    # What a camera has by default is left out, so that files from before it had that keep their digest.
+    own = [(f.name, getattr(camera, f.name)) for f in fields(camera) if getattr(camera, f.name) != f.default]
+    look = ", ".join(
+        [
+            *map(repr, (lights, sensor.coat, sensor.case)),
+            f"CameraSpec({', '.join(f'{name}={value!r}' for name, value in own)})",
+            *map(repr, (sensor.response, sensor.optics)),
+        ]
+    )
+    return hashlib.sha256(f"({look})".encode()).hexdigest()[:16]
+
+
+def check_straight(name: str, sensor: SensorSpec) -> None:
+    """Raise InputError for a tilted or distorting camera: networks know even pixels alone."""
+    if not sensor.camera.lens.is_plain:
+        rule = f"cannot show the distortion or tilt of the camera of {sensor.name!r}: it was fitted to pixels of one size"
+        raise InputError("optics", value=name, rule=rule, choices=("raytrace", "taxim", "phong"))
 
 
 def check_view(name: str, sensor: SensorSpec, view: tuple[float, float] | None, provenance: dict[str, str]) -> None:

@@ -13,9 +13,9 @@ from raytac.errors import BackendError, InputError
 from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.camera import Pinhole
 from raytac.optics.device_mode import DeviceFrame, DeviceMode, Float, FrameInputs, UInt8
-from raytac.optics.image.base import see_heights
+from raytac.optics.image.base import grey_levels, see_heights
 from raytac.optics.image.config import Unet
-from raytac.optics.image.network_files import check_view, look_digest
+from raytac.optics.image.network_files import check_straight, check_view, look_digest
 from raytac.optics.image.unet_weights import UnetWeights, load_unet
 from raytac.optics.ink import darkened
 
@@ -53,6 +53,7 @@ class UnetMode(DeviceMode):
         module = _network_module()
         torch = import_module("torch")
         self.weights = self._own_weights()
+        check_straight("unet", self.sensor)
         check_view("unet", self.sensor, self.weights.view, self.weights.provenance)
         height, width = self.weights.background.shape[:2]
         self._seeing = Pinhole.from_spec(self.sensor.camera, (width, height), self.slab)
@@ -132,12 +133,15 @@ class UnetMode(DeviceMode):
     def _made(self, heights: Float, contact: UInt8 | None, ink: Float | None) -> DeviceFrame:
         mi = self.mi
         levels = self._levels(heights, contact)
-        if ink is None:
+        if ink is None and not self.sensor.camera.monochrome:
             flat = dr.clip(mi.Float(levels.reshape(-1)) + 0.5, 0, 255)
         else:
             channels = [mi.Float(levels[..., c].reshape(-1)) for c in range(3)]
-            dots = self._recorded(self._ink, heights, None, ink)
-            flat = dr.ravel(mi.Color3f([dr.clip(c + 0.5, 0, 255) for c in darkened(self.sensor, channels, dots)]))
+            if ink is not None:
+                channels = darkened(self.sensor, channels, self._recorded(self._ink, heights, None, ink))
+            if self.sensor.camera.monochrome:
+                channels = grey_levels(channels)
+            flat = dr.ravel(mi.Color3f([dr.clip(c + 0.5, 0, 255) for c in channels]))
         rgb = mi.UInt8(flat)
         dr.eval(rgb)
         dr.sync_thread()  # PyTorch may use the memory of the levels again

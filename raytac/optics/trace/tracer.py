@@ -40,7 +40,8 @@ class Tracer(DeviceMode):
         self._scene_lamps = [Lamp.from_spec(self.mi, led, UNIT) for led in leds]
         # Of a mode without images, nobody asks how bright they are.
         unlit = replace(sensor.response, exposure=1.0)
-        self.response = Response(unlit if sensor.response.exposure == AUTO else sensor.response, self.camera)
+        spec = unlit if sensor.response.exposure == AUTO else sensor.response
+        self.response = Response(spec, self.camera, monochrome=sensor.camera.monochrome)
         if config.flat_field is not None:
             self._check_image("flat_field", config.flat_field)
 
