@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,11 @@ def view_size(sensor: SensorSpec) -> tuple[float, float]:
 
 
 def look_digest(sensor: SensorSpec) -> str:
-    """Digest of a sensor's lights, coat, case, camera and response: all that shapes its image."""
-    look = (sensor.lights, sensor.coat, sensor.case, sensor.camera, sensor.response, sensor.optics)
+    """Digest of a sensor's lights, coat, case, camera and response: all that shapes its image.
+
+    It does not depend on where the files lie.
+    """
+    look = (replace(sensor.lights, source=None), sensor.coat, sensor.case, sensor.camera, sensor.response, sensor.optics)
     return hashlib.sha256(repr(look).encode()).hexdigest()[:16]
 
 
