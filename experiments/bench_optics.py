@@ -4,6 +4,7 @@ Every frame has a new surface, and everything from the height field to the 8-bit
 
     python experiments/bench_optics.py --out runs/bench_optics                      # about 20 minutes on two cores
     python experiments/bench_optics.py --out runs/bench_cuda --device cuda --parts speed,error
+    python experiments/bench_optics.py --against ../raytac_b682ef2                      # frames in turn with another checkout's, on the CPU
 
 docs/measurements/image-modes.md explains the figures. References are kept in DIR/references by content, so that an interrupted run goes on.
 """
@@ -25,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from experiments.running import recorded, run
+from experiments.turns import in_turn
 from raytac.errors import InputError, RaytacError
 from raytac.gel import GelSurface
 from raytac.io import CommonOptions, Metric, Progress, parse_names
@@ -95,6 +97,8 @@ class Args(CommonOptions):
     """Timed frames a figure (at least 40 for a median to quote)."""
     quick: bool = False
     """80x60, one scene, 16 samples, five frames: shows that all runs; its figures mean nothing."""
+    against: Path | None = None
+    """Checkout of another commit: only frames in turn with its own sensor of that name, one environment on the CPU (``turns.py``)."""
 
 
 @dataclass(frozen=True)
@@ -467,6 +471,10 @@ def main(args: Args) -> None:
     if args.spp < 2 or args.frames < 1:
         raise InputError("spp, frames", value=(args.spp, args.frames), rule="must be at least 2 and 1")
     out = args.out if args.out is not None else Path("runs") / "bench_optics"
+    if args.against is not None:
+        with recorded(args, "bench_optics", device="cpu") as (_, metrics):
+            metrics |= {**machine(), **in_turn(args.against, {"fast.cpu.320x240": f"frame:{args.sensor}"})}
+        return
     from raytac.optics import load_mitsuba
 
     device = load_mitsuba(args.device)[1]

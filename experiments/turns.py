@@ -3,6 +3,7 @@
     git worktree add --detach ../raytac_b682ef2 b682ef2
     python experiments/bench_ipc.py --sizes 300,1400 --against ../raytac_b682ef2 --out runs/bench_ipc_against
     python experiments/bench_soft.py --levels coarse --against ../raytac_b682ef2 --out runs/bench_soft_against
+    python experiments/bench_optics.py --against ../raytac_b682ef2 --out runs/bench_optics_against
 
 Each checkout has a process of its own, which waits while the other makes its step: a load that comes and goes slows both alike. What is
 compared is processor time. The scenes are those of this checkout, made with what both offer; each process runs
@@ -131,7 +132,7 @@ def commit(checkout: Path) -> str:
 
 def steps_of(scene: str) -> int:
     """Steps of a round."""
-    return {"press": 20, "pad": 9}[scene.partition(":")[0]]
+    return {"press": 20, "pad": 9, "frame": 40}[scene.partition(":")[0]]
 
 
 def press(size: str) -> Iterator[Callable[[], object]]:
@@ -173,11 +174,31 @@ def pad(level: str) -> Iterator[Callable[[], object]]:
             yield lambda states=states: sensor.update(next(states))
 
 
+def frame(name: str) -> Iterator[Callable[[], object]]:
+    """Images by ``fast`` of the sensor ``name``, 320 × 240.
+
+    Presses of the rigid pad take turns, at 70 to 100 % of their depths.
+    """
+    from raytac.sensor import TactileSensor
+
+    sensor = TactileSensor(name, outputs=("rgb",), device="cpu", seed=0)
+    surfaces = [sensor.press(scene).surface for scene in ("sphere", "coin", "pins", "cone")]
+    rest, k = surfaces[0].grid.rest.astype(np.float32), 0
+    while True:
+        surface = surfaces[k % len(surfaces)]
+        share = np.float32(0.7 + 0.3 * (0.618034 * k % 1))
+        moved = replace(surface, height=rest + share * (surface.height - rest))
+        yield lambda moved=moved: np.asarray(sensor.update(moved).rgb)
+        k += 1
+
+
 def main(scene: str) -> None:
     """Make a step for every line of the input."""
     kind, _, size = scene.partition(":")
-    first = {"press": 0, "pad": 2}[kind]  # steps of a round that are not counted: at rest, and before anything touches
-    for k, step in enumerate({"press": press, "pad": pad}[kind](size)):
+    first = {"press": 0, "pad": 2, "frame": 0}[
+        kind
+    ]  # steps of a round that are not counted: at rest, and before anything touches
+    for k, step in enumerate({"press": press, "pad": pad, "frame": frame}[kind](size)):
         if not sys.stdin.readline():
             return
         began = time.process_time()

@@ -19,9 +19,9 @@ from raytac.warp_messages import quiet_warp
 class CompareRealArgs(FitOptions):
     """Fit ray tracer, table and network to real presses of balls, and test them on the others.
 
-    Phong's model is tested too. Writes real.md (tables), real.png (photographs, every mode, signed errors), drift.csv and
-    metrics.json. Without
-    --out the folder is runs/compare-real/SENSOR. An error or Ctrl-C leaves the folder as it was.
+    Phong's model is tested too. Writes real.md (tables), real.png (photographs, every mode, signed errors), drift.csv, presses.csv (errors
+    of every held-out press) and metrics.json. Without --out the folder is runs/compare-real/SENSOR. An error or Ctrl-C leaves the folder as
+    it was.
     """
 
     data: Annotated[Path, tyro.conf.Positional]

@@ -27,7 +27,7 @@ from raytac.io.progress import Progress
 from raytac.optics.trace.config import RayTraced
 from raytac.report.real_drift import drift_metrics, drift_rows, grain_metrics, session_lines
 from raytac.report.real_imprints import FITTED, check_imprints, imprint_metrics, imprint_scores, imprint_table
-from raytac.report.real_scores import noise_floor, outliers, press_scores, summary
+from raytac.report.real_scores import noise_floor, outliers, press_rows, press_scores, summary
 from raytac.specs import SensorSpec
 from raytac.specs.press import PADS
 
@@ -124,7 +124,7 @@ class RealSettings:
 def compare_real(
     sensor: SensorSpec, presses: RealPresses, shots: Photographs, out: Path, settings: RealSettings, *, began: float | None = None
 ) -> list[Path]:
-    """Fit, test and write ``real.md``, ``real.png`` and ``metrics.json`` to ``out``.
+    """Fit, test and write ``real.md``, ``real.png``, tables and ``metrics.json`` to ``out``.
 
     ``shots`` are the ``presses``. Those at the border are fitted with the others, and tested apart: keys ``border.…``.
 
@@ -146,6 +146,7 @@ def compare_real(
             raise InputError("presses", value=count, rule=rule)
     ablations = list(ABLATIONS) if settings.ablations else []
     scores: dict[str, dict[str, list[dict[str, float]]]] = {}
+    tested: dict[str, list[str]] = {}
     metrics: dict[str, Metric] = {}
     priors: dict[str, list[str]] = {}
     starts: dict[str, list[tuple[float, ...]]] = {}
@@ -164,6 +165,7 @@ def compare_real(
                     if not len(part):
                         continue
                     both = _tested(models, sensor, shots.take(part))
+                    tested.setdefault(prefix + kind, []).extend(presses.names[k] for k in part)
                     for where, scores_of in zip(("", "labelled_"), both, strict=True):
                         for mode, stack in scores_of.items():
                             of = scores.setdefault(where + prefix + kind, {}).setdefault(mode, [])
@@ -236,10 +238,11 @@ def compare_real(
         (folder / "real.md").write_text(table_text(metrics, ablations), "utf-8")
         rows = drift_rows(tuple(presses.names[k] for k in np.flatnonzero(whole)), steady.drift)
         (folder / "drift.csv").write_text("\n".join(rows) + "\n", "utf-8")
+        (folder / "presses.csv").write_text("\n".join(press_rows(tested, scores)) + "\n", "utf-8")
         shown = sorted(images)[len(images) // (2 * SHOWN) :: max(1, len(images) // SHOWN)][:SHOWN]
         draw(shots.presses[shown], [images[k] for k in shown], [shots.circles[k] for k in shown], folder / "real.png")
         write_metrics(folder / "metrics.json", head | metrics | {"wall_s": time.perf_counter() - began})
-    return [out / name for name in ("real.md", "real.png", "drift.csv", "metrics.json")]
+    return [out / name for name in ("real.md", "real.png", "drift.csv", "presses.csv", "metrics.json")]
 
 
 _PREFIXES = {"press": "", "labelled_press": "labelled.", "border_press": "border.", "labelled_border_press": "labelled.border."}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -53,6 +53,20 @@ def press_scores(sensor: SensorSpec, images: np.ndarray, shots: Photographs) -> 
 def summary(scores: list[dict[str, float]]) -> dict[str, float]:
     """Means over presses."""
     return {key: float(np.mean([score[key] for score in scores])) for key in scores[0]}
+
+
+def press_rows(names: Mapping[str, Sequence[str]], scores: Mapping[str, Mapping[str, list[dict[str, float]]]]) -> list[str]:
+    """Lines of a CSV file of every held-out press under every mode, at refined circles.
+
+    ``names``: presses by kind of split, ``scores``: their errors by kind and mode, in that order. Two runs over the same presses are
+    compared press by press: presses differ from each other by more than modes do.
+    """
+    lines = ["split,press,mode,contact_mae,ring_mae"]
+    for kind, presses in names.items():
+        for mode, of in scores[kind].items():
+            for name, score in zip(presses, of, strict=True):
+                lines.append(f"{kind},{name},{mode},{score['contact_mae']:.4f},{score['ring_mae']:.4f}")
+    return lines
 
 
 def outliers(names: Sequence[str], errors: np.ndarray, circles: np.ndarray, shots: Photographs) -> dict[str, str]:

@@ -49,3 +49,17 @@ def test_quick_run_measures_everything_and_keeps_its_reference(
     bench.main(bench.Args(out=tmp_path, device="cpu", quick=True, parts="error"))
     assert list((tmp_path / "references").iterdir()) == kept and kept[0].stat().st_mtime_ns == written
     assert read_metrics(tmp_path / "metrics.json")["fast.cpu.80x60.psnr_db"] == metrics["fast.cpu.80x60.psnr_db"]
+
+
+def test_a_checkout_is_compared_with_one_that_is_there(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="must be a checkout of this project"):
+        bench.main(bench.Args(out=tmp_path / "out", device="cpu", against=tmp_path))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_frames_of_a_checkout_in_turn_with_its_own(tmp_path: Path) -> None:
+    bench.main(bench.Args(out=tmp_path, device="cpu", against=Path(__file__).parents[2]))
+    metrics = read_metrics(tmp_path / "metrics.json")
+    ratios = [float(value) for key, value in metrics.items() if key.startswith("fast.cpu.320x240.speedup_vs_")]
+    assert len(ratios) == 1 and 0.5 < ratios[0] < 2.0

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from raytac.assets import asset_root
 from raytac.errors import BackendError, CalibrationError, InputError
 from raytac.gel.surface import GelSurface
 from raytac.optics import Unet, UnetWeights, load_unet, look_digest, save_unet
@@ -74,6 +75,26 @@ def test_without_pytorch_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(BackendError, match=r"needs PyTorch .*pip install torch"):
         Unet(weights=network()).build(make_sensor_spec(), device="cpu")
+
+
+def test_a_look_is_what_the_files_say_wherever_they_lie(tmp_path: Path) -> None:
+    mini = load_sensor("gelsight_mini")
+    assert mini.source is not None and mini.lights.source is not None
+    text = mini.source.read_text("utf-8")
+    assert 'lights = "gelsight_mini"' in text
+    (tmp_path / "mini.toml").write_text(text.replace('lights = "gelsight_mini"', 'lights = "lights.toml"'), "utf-8")
+    lights = mini.lights.source.read_text("utf-8")
+    (tmp_path / "lights.toml").write_text(lights, "utf-8")
+    assert look_digest(load_sensor(tmp_path / "mini.toml")) == look_digest(mini)
+    assert "lobe = 5.11" in lights
+    (tmp_path / "lights.toml").write_text(lights.replace("lobe = 5.11", "lobe = 5.12"), "utf-8")
+    assert look_digest(load_sensor(tmp_path / "mini.toml")) != look_digest(mini)
+
+
+def test_the_shipped_network_is_of_the_default_minis_look() -> None:
+    shipped = load_unet(asset_root("scenes") / "networks" / "gelsight_mini_unet.npz")
+    assert shipped.provenance["sensor"] == "gelsight_mini"
+    assert shipped.provenance["look"] == look_digest(load_sensor("gelsight_mini"))
 
 
 class TestWithTorch:

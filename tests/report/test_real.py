@@ -27,7 +27,7 @@ from raytac.report.markers import run_calibrate_markers
 from raytac.report.real import RealSettings, real_splits, table_text
 from raytac.report.real_calibration import run_calibrate_optics
 from raytac.report.real_imprints import imprint_metrics, imprint_table
-from raytac.report.real_scores import noise_floor, outliers, press_scores, summary
+from raytac.report.real_scores import noise_floor, outliers, press_rows, press_scores, summary
 from raytac.sensor import TactileSensor
 from raytac.specs import load_sensor
 
@@ -57,6 +57,18 @@ def test_errors_are_those_of_the_regions() -> None:
     metrics = {"raytrace.contact_mae": 6.0, "labelled.raytrace.contact_mae": 7.0, "labelled.raytrace.ring_mae": 4.0}
     text = table_text({**metrics, "noise_floor": 2.0}, ())
     assert "| ray tracer | 6.00 |" in text and "| 7.00, 4.00 |" in text and "Noise floor: 2.00" in text
+
+
+def test_errors_are_listed_by_press() -> None:
+    """In the order of the presses, folds after each other; labelled circles are not among them."""
+    scores = [{"contact_mae": float(k), "ring_mae": 2.0 * k, "frame_mae": 9.0} for k in range(3)]
+    both = {"press": {"raytrace": scores[:2], "mlp": scores[1:]}, "labelled_press": {"raytrace": scores[:2]}}
+    lines = press_rows({"press": ["a", "b"]}, both)
+    assert lines[0] == "split,press,mode,contact_mae,ring_mae"
+    assert lines[1:3] == ["press,a,raytrace,0.0000,0.0000", "press,b,raytrace,1.0000,2.0000"]
+    assert lines[3:] == ["press,a,mlp,1.0000,2.0000", "press,b,mlp,2.0000,4.0000"]
+    with pytest.raises(ValueError, match="shorter"):
+        press_rows({"press": ["a", "b", "c"]}, both)
 
 
 def data_set(folder: Path, count: int, radius: float = 30.0, shape: tuple[int, int] = (240, 320)) -> Path:
@@ -188,6 +200,9 @@ def test_compare_real_scores_every_mode(of_itself: tuple[Path, np.ndarray], tmp_
     text = (out / "real.md").read_text("utf-8")
     assert f"| ray tracer, no photograph | {metrics['raytrace_alone.contact_mae']:.2f} |" in text
     assert (out / "real.png").stat().st_size > 10_000
+    rows = [line.split(",") for line in (out / "presses.csv").read_text("utf-8").splitlines()]
+    errors = [float(row[3]) for row in rows if row[0] == "press" and row[2] == "raytrace"]
+    assert np.mean(errors) == pytest.approx(metrics["raytrace.contact_mae"], abs=1e-4) and len(set(errors)) == len(errors) > 1
     # The images are of the profile that is fitted, at the depth of the circle; the other imprints are of other surfaces.
     fitted, rigid = metrics["imprint.fitted.raytrace.contact_mae"], metrics["imprint.rigid.raytrace.contact_mae"]
     assert fitted < 1.5 and fitted < rigid < metrics["background.contact_mae"]

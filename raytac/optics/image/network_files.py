@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import fields, replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,23 +27,24 @@ def view_size(sensor: SensorSpec) -> tuple[float, float]:
 def look_digest(sensor: SensorSpec) -> str:
     """Digest of a sensor's lights, coat, case, camera and response: all that shapes its image.
 
-    Where its files lie does not.
+    It does not depend on where the files lie.
     """
-    camera, lights = sensor.camera, replace(sensor.lights, source=None)
-    # What a camera has by default is left out, so that files from before it had that keep their digest.
-    own = [(f.name, getattr(camera, f.name)) for f in fields(camera) if getattr(camera, f.name) != f.default]
-    look = ", ".join(
-        [
-            *map(repr, (lights, sensor.coat, sensor.case)),
-            f"CameraSpec({', '.join(f'{name}={value!r}' for name, value in own)})",
-            *map(repr, (sensor.response, sensor.optics)),
-        ]
-    )
-    return hashlib.sha256(f"({look})".encode()).hexdigest()[:16]
+    lights = replace(sensor.lights, source=None)
+    look = [_given(part) for part in (lights, sensor.coat, sensor.case, sensor.camera, sensor.response, sensor.optics)]
+    return hashlib.sha256(repr(look).encode()).hexdigest()[:16]
+
+
+def _given(value: Any) -> Any:
+    """Fields that are not at their defaults: a field that a later version adds leaves the digest as it is."""
+    if isinstance(value, tuple):
+        return tuple(map(_given, value))
+    if not is_dataclass(value):
+        return value
+    return {f.name: _given(getattr(value, f.name)) for f in fields(value) if getattr(value, f.name) != f.default}
 
 
 def check_straight(name: str, sensor: SensorSpec) -> None:
-    """Raise InputError for a tilted or distorting camera: networks know even pixels alone."""
+    """Raise ``InputError`` for a tilted or distorting camera: networks know even pixels alone."""
     if not sensor.camera.lens.is_plain:
         rule = f"cannot show the distortion or tilt of the camera of {sensor.name!r}: it was fitted to pixels of one size"
         raise InputError("optics", value=name, rule=rule, choices=("raytrace", "taxim", "phong"))

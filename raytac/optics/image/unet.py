@@ -70,8 +70,8 @@ class UnetMode(DeviceMode):
             return weights if isinstance(weights, UnetWeights) else load_unet(weights)
         shipped = load_unet(asset_root("scenes") / "networks" / "gelsight_mini_unet.npz")
         if shipped.provenance.get("look") != look_digest(self.sensor):
-            rule = f"must name a network for the sensor {self.sensor.name!r}: the one that comes with raytac is of other lights or another "
-            rule += "camera (`python experiments/train_unet.py` fits one)"
+            rule = f"must name a network for the sensor {self.sensor.name!r} (`python experiments/train_unet.py` fits one): "
+            rule += f"the one that comes with raytac is for lights and camera of {shipped.provenance.get('sensor')!r}"
             raise InputError("weights", rule=rule)
         return shipped
 
