@@ -334,6 +334,6 @@ def _is_held(layout: Layout) -> bool:
 
     A free body slides and lands by its inertia. Its normal forces before Newton's method has balanced them say little of its friction.
     """
-    held = (layout.node_free == 0) | (layout.node_drive > 0)
-    held[layout.grip_node] = True
-    return np.isin(layout.node_body, layout.node_body[held]).all().item()
+    fixed = (layout.node_free == 0) | (layout.node_drive > 0)
+    fixed[layout.grip_node] = True
+    return np.isin(layout.node_body, layout.node_body[fixed]).all().item()

@@ -35,7 +35,10 @@ def look_digest(sensor: SensorSpec) -> str:
 
 
 def _given(value: Any) -> Any:
-    """Fields that are not at their defaults: a field that a later version adds leaves the digest as it is."""
+    """Fields that are not at their defaults.
+
+    A field that a later version adds leaves the digest as it is.
+    """
     if isinstance(value, tuple):
         return tuple(map(_given, value))
     if not is_dataclass(value):
