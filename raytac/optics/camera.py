@@ -64,8 +64,8 @@ class Pinhole:
 
         With the pinhole a distance d below the gel plane, a pixel of pitch p there is the angle p / d: f = d / p. The pitch is what
         a ruler on the gel plane shows, so behind a slab d is the apparent distance: that in air plus the slab's thickness over n.
-        This holds about the optical axis; farther out the plane z = 0 appears distorted (docs/refraction.md). Of a tilted camera,
-        which has no slab, d is the distance along its optical axis.
+        This holds about the optical axis; farther out the plane z = 0 appears distorted (docs/refraction.md). Of a tilted camera, which
+        has no slab, d is the distance along its optical axis.
         """
         width, height = spec.resolution if resolution is None else resolution
         sx, sy = width / spec.resolution[0], height / spec.resolution[1]
