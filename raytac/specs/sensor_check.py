@@ -89,14 +89,16 @@ def _check_camera(sensor: SensorSpec) -> None:
         rule = f"the camera must lie inside the case, {_case_rule(sensor)}"
         raise _error(sensor, "camera.position_mm", in_mm(camera.position), rule)
     _check_lens(sensor)
-    if not camera.lens.is_plain:
+    if camera.lens.is_plain:
+        view = tuple(n * pitch for n, pitch in zip(camera.resolution, camera.pixel_pitch, strict=True))
+        centre = tuple(
+            at + (n / 2 - principal) * pitch
+            for at, n, principal, pitch in zip((x, y), camera.resolution, camera.principal_point, camera.pixel_pitch, strict=True)
+        )
+    else:
         _check_view(sensor)
-        return
-    view = tuple(n * pitch for n, pitch in zip(camera.resolution, camera.pixel_pitch, strict=True))
-    centre = tuple(
-        at + (n / 2 - principal) * pitch
-        for at, n, principal, pitch in zip((x, y), camera.resolution, camera.principal_point, camera.pixel_pitch, strict=True)
-    )
+        edges = view_edges(sensor)
+        view, centre = tuple(high - low for low, high in edges), tuple(0.5 * (low + high) for low, high in edges)
     if any(abs(c) > size / 2 for c, size in zip(centre, pad.size, strict=True)):
         rule = f"the camera does not see the pad: its view is centred at {in_mm(centre)} mm, off the pad of {in_mm(pad.size)} mm"
         raise _error(sensor, "camera.position_mm", in_mm(camera.position), rule)
@@ -110,15 +112,14 @@ def _check_camera(sensor: SensorSpec) -> None:
 def _check_lens(sensor: SensorSpec) -> None:
     """Check that distortion has an inverse over the image, and that tilt is not too large."""
     camera, lens = sensor.camera, sensor.camera.lens
-    if lens.tilts:
-        if sensor.refraction.model == "slab":
-            rule = (
-                "must be [0, 0, 0] with refraction.model = 'slab': the pixel pitch of a tilted camera is not defined behind one"
-            )
-            raise _error(sensor, "camera.tilt_deg", [math.degrees(angle) for angle in camera.tilt], rule)
-        if lens.axis[2] < 0.5:
-            rule = f"turns the camera by {math.degrees(math.acos(lens.axis[2])):.4g} degrees from +z: must be at most 60"
-            raise _error(sensor, "camera.tilt_deg", [math.degrees(angle) for angle in camera.tilt], rule)
+    tilt = [math.degrees(angle) for angle in camera.tilt]
+    if not lens.is_plain and sensor.refraction.model == "slab":
+        key, value = ("tilt_deg", tilt) if lens.tilts else ("distortion", list(camera.distortion))
+        rule = "must be 0 with refraction.model = 'slab': what a pixel is on the gel is not defined for both"
+        raise _error(sensor, f"camera.{key}", value, rule)
+    if lens.tilts and lens.axis[2] < 0.5:
+        rule = f"turns the camera by {math.degrees(math.acos(lens.axis[2])):.4g} degrees from +z: must be at most 60"
+        raise _error(sensor, "camera.tilt_deg", tilt, rule)
     if lens.distorts:
         (width, height), (cx, cy), (fx, fy) = camera.resolution, camera.principal_point, camera.focal
         x, y = np.meshgrid((np.linspace(0, width, 33) - cx) / fx, (np.linspace(0, height, 33) - cy) / fy)
@@ -132,7 +133,7 @@ def _check_lens(sensor: SensorSpec) -> None:
             raise _error(sensor, "camera.distortion", list(camera.distortion), rule)
     if lens.tilts and (steepest := float(np.hypot(*camera.border()).max())) > _STEEPEST:
         rule = f"the steepest ray has a slope of {steepest:.3g} to the pad's z: must be at most {_STEEPEST:g}"
-        raise _error(sensor, "camera.tilt_deg", [math.degrees(angle) for angle in camera.tilt], rule)
+        raise _error(sensor, "camera.tilt_deg", tilt, rule)
 
 
 def _check_view(sensor: SensorSpec) -> None:
@@ -147,6 +148,10 @@ def _check_view(sensor: SensorSpec) -> None:
                 f"the view runs off the pad: at z = 0 it covers {name} = {low * 1e3:.4g} to {high * 1e3:.4g} mm, "
                 f"must stay within {-half * 1e3:.4g} to {half * 1e3:.4g} mm"
             )
+            if camera.lens.tilts:
+                raise _error(sensor, "camera.tilt_deg", [math.degrees(angle) for angle in camera.tilt], rule)
+            if camera.lens.distorts:
+                raise _error(sensor, "camera.distortion", list(camera.distortion), rule)
             if abs((pixels / 2 - principal) * pitch) > abs(at):
                 raise _error(sensor, "camera.principal_point_px", list(camera.principal_point), rule)
             raise _error(sensor, "camera.position_mm", in_mm(camera.position), rule)
