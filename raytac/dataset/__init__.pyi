@@ -1,6 +1,7 @@
 from .arrays import ARRAYS as ARRAYS
 from .arrays import COLUMNS as COLUMNS
 from .arrays import DATASET_OUTPUTS as DATASET_OUTPUTS
+from .backgrounds import RandomBackground as RandomBackground
 from .episode import Episode as Episode
 from .episode import press_episodes as press_episodes
 from .episode import record_episode as record_episode
