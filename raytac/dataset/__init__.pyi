@@ -14,6 +14,7 @@ from .plan import Presses as Presses
 from .renderer import RenderJob as RenderJob
 from .renderer import ShardRenderer as ShardRenderer
 from .renderer import ShardResult as ShardResult
+from .rerun_log import write_rerun as write_rerun
 from .run import ENGINES as ENGINES
 from .run import Check as Check
 from .run import RunReport as RunReport
