@@ -29,7 +29,8 @@ def test_render_resume_and_verify(tmp_path: Path, capsys: pytest.CaptureFixture[
     args = Args(**asked, count=3, shard_size=2, seed=9, outputs="height", batch=2, sheet=3)
     main(args)
     data = PressDataset(tmp_path / "data")
-    assert len(data) == 3 and set(data[0]) == {"index", "height", "pad_from_object"} and data.description["plan"]["seed"] == 9
+    assert len(data) == 3 and set(data[0]) == {"index", "height", "pad_from_object", "object", "label"}
+    assert data.description["plan"]["seed"] == 9
     assert read_png(tmp_path / "data/sheet.png").shape[2] == 3
     metrics = read_metrics(tmp_path / "data/metrics.json")
     assert metrics["presses"] == 3 and metrics["rendered.shards"] == 2 and isinstance(metrics["presses_per_s"], float)
