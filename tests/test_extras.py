@@ -34,6 +34,8 @@ sys.meta_path.insert(0, Without())
         (("gymnasium",), "from raytac.observe import AddTactile", "pip install 'raytac[rl]'"),
         (("gymnasium",), "import raytac.envs", "pip install 'raytac[rl]'"),
         (("torch",), "from raytac.envs import WarpBatch", "WarpBatch needs PyTorch, which is not installed: pip install 'raytac[rl]'"),
+        (("h5py",), "from raytac.dataset import write_hdf5; write_hdf5('new.h5', [])", "pip install 'raytac[export]'"),
+        (("zarr",), "from raytac.dataset import write_zarr; write_zarr('new.zarr', [])", "pip install 'raytac[export]'"),
         (("torch",), "from raytac.dataset import PressTensors", "PressTensors needs PyTorch, which is not installed: pip install torch"),
         (("torch",), VECTOR, "pip install 'raytac[rl]'"),
         (("mujoco_warp",), "import raytac; raytac.TactileWorld('push_cube', engine='mujoco_warp')", "pip install 'raytac[gpu]'"),

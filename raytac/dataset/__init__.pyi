@@ -1,6 +1,7 @@
 from .arrays import ARRAYS as ARRAYS
 from .arrays import COLUMNS as COLUMNS
 from .arrays import DATASET_OUTPUTS as DATASET_OUTPUTS
+from .backgrounds import RandomBackground as RandomBackground
 from .episode import Episode as Episode
 from .episode import press_episodes as press_episodes
 from .episode import record_episode as record_episode
@@ -13,6 +14,7 @@ from .plan import Presses as Presses
 from .renderer import RenderJob as RenderJob
 from .renderer import ShardRenderer as ShardRenderer
 from .renderer import ShardResult as ShardResult
+from .rerun_log import write_rerun as write_rerun
 from .run import ENGINES as ENGINES
 from .run import Check as Check
 from .run import RunReport as RunReport

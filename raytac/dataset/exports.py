@@ -35,7 +35,7 @@ def write_hdf5(path: str | Path, data: Source, *, compress: bool = True, progres
 
     Args:
         path: file that must not exist.
-        data: a ``PressDataset`` without a transform, of one sensor; or episodes, which are read one at a time.
+        data: a ``PressDataset`` of one sensor, whose transform, if it has one, gives arrays by name; or episodes, read one at a time.
         compress: deflate the arrays.
         progress: show the presses or episodes that are written.
 
@@ -98,7 +98,7 @@ def _write_presses(root: Any, data: PressDataset, make: Make, progress: bool) ->
         raise InputError("data set", value=data.folder, rule="must hold a sound press")
     first = data[0]
     if not isinstance(first, dict):
-        raise InputError("data", value=type(first).__name__, rule="must give samples by name: leave out its transform")
+        raise InputError("data", value=type(first).__name__, rule="must give samples by name: open it without its transform")
     about = {**data.description["columns"], **data.description["arrays"], **data.description["arrays_of_a_shard"]}
     about["label"] = {"unit": "", "meaning": "number of the object among the classes"}
     root.attrs["classes"] = list(data.classes)
@@ -109,7 +109,7 @@ def _write_presses(root: Any, data: PressDataset, make: Make, progress: bool) ->
         kind, shape = (str, ()) if isinstance(value, str) else (value.dtype, value.shape)
         rows = block if isinstance(value, str) else min(block, _power(_CHUNK_BYTES // max(value.nbytes, 1)))
         made[name] = make(root, name, (len(data), *shape), kind, rows)
-        made[name].attrs.update({"unit": about[name]["unit"], "meaning": about[name]["meaning"]})
+        made[name].attrs.update({key: about.get(name, {}).get(key, "") for key in ("unit", "meaning")})
     with Progress(desc="export", total=len(data), unit="press", show=progress) as bar:
         for start in range(0, len(data), block):
             samples = [data[i] for i in range(start, min(start + block, len(data)))]
@@ -121,12 +121,11 @@ def _write_presses(root: Any, data: PressDataset, make: Make, progress: bool) ->
                 array[start : start + len(values)] = stacked
             bar.update(len(samples))
     if _MAPS & set(made):
-        for name in ("grid_x", "grid_y"):
+        for name in {"grid_x", "grid_y"} - set(made):
             values = data.shared(0)[name]
-            array = made.get(name) or make(root, name, values.shape, values.dtype, len(values))
-            if name not in made:
-                array[:] = values
-                array.attrs.update({"unit": about[name]["unit"], "meaning": about[name]["meaning"]})
+            array = make(root, name, values.shape, values.dtype, len(values))
+            array[:] = values
+            array.attrs.update({key: about[name][key] for key in ("unit", "meaning")})
 
 
 def _check_shapes(name: str, start: int, values: list[np.ndarray], shape: tuple[int, ...]) -> None:

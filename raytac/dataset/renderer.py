@@ -161,9 +161,7 @@ class ShardRenderer:
         each = self.plan.sweep.frames_per_stage
         if each is None:
             return [_Taken(sensor.press(scene, **own), np.full(self.job.batch, np.nan))]
-        readings = sensor.load(scene, **own).run(each)
-        # A frame waits for its images when it is read: read now, so that those of a whole press do not wait on the device.
-        return [_Taken(frame, reading.depth) for reading in readings if (frame := sensor.update(reading)).outputs]
+        return [_Taken(sensor.update(reading), reading.depth) for reading in sensor.load(scene, **own).run(each)]
 
     def _own(self, presses: Presses, batch: int | None = None) -> dict[str, Any]:
         """Arguments of ``TactileSensor.press``; environments without a press fail from the start."""

@@ -27,7 +27,8 @@ def test_render_resume_and_verify(tmp_path: Path, capsys: pytest.CaptureFixture[
     small = ["--count", "3", "--shard-size", "2", "--seed", "9", "--outputs", "height", "--batch", "2", "--sheet", "3"]
     assert main([*asked, *small]) == 0
     data = PressDataset(tmp_path / "data")
-    assert len(data) == 3 and set(data[0]) == {"index", "height", "pad_from_object"} and data.description["plan"]["seed"] == 9
+    assert len(data) == 3 and set(data[0]) == {"index", "height", "pad_from_object", "object", "label"}
+    assert data.description["plan"]["seed"] == 9
     assert read_png(tmp_path / "data/sheet.png").shape[2] == 3
     metrics = read_metrics(tmp_path / "data/metrics.json")
     assert metrics["presses"] == 3 and metrics["rendered.shards"] == 2 and isinstance(metrics["presses_per_s"], float)

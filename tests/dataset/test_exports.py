@@ -72,6 +72,18 @@ def test_chunks_follow_the_size_of_a_press(kind: tuple[Callable[..., Path], Open
     assert height.shape[0] == 4 and root["press_depth"].chunks == (4,)
 
 
+def half(sample: dict[str, Any]) -> dict[str, Any]:
+    return {"label": sample["label"], "half": sample["height"] / 2.0}
+
+
+def test_what_a_transform_makes_is_exported(kind: tuple[Callable[..., Path], Opener], folder: Path, tmp_path: Path) -> None:
+    write, opened = kind
+    plain = PressDataset(folder)
+    root = opened(write(tmp_path / "presses", PressDataset(folder, transform=half)))
+    assert set(root) == {"label", "half", "description"} and root["half"].attrs["unit"] == ""
+    np.testing.assert_array_equal(root["half"][3], plain[3]["height"] / 2.0)
+
+
 def test_episodes_are_read_back_one_group_each(kind: tuple[Callable[..., Path], Opener], folder: Path, tmp_path: Path) -> None:
     write, opened = kind
     data = PressDataset(folder)
@@ -104,7 +116,7 @@ def test_what_cannot_be_exported_leaves_nothing(
 
     for data, message in (
         (PressDataset(tmp_path / "two"), "height of press 4 .*choose presses of one with sensor="),
-        (PressDataset(folder, transform=tuple), "leave out its transform"),
+        (PressDataset(folder, transform=tuple), "open it without its transform"),
         ([], "at least one episode"),
         ([{"x": np.zeros(3)}], "iterable of episodes"),
     ):

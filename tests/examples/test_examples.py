@@ -21,6 +21,7 @@ SAYS = {
     "own_mujoco_model": "right: normal force",
     "own_vector_env": "force on each cube",
     "press": "force",
+    "record_lerobot": "data/chunk-000/file-000.parquet",
     "relight": "without blue",
     "ros_messages": "deepest imprint in the cloud: ",
 }
@@ -40,7 +41,7 @@ def test_an_example_fits_on_a_screen_and_says_how_to_run_it(path: Path) -> None:
 
 @pytest.mark.parametrize("name", sorted(SAYS))
 def test_an_example_runs(name: str, tmp_path: Path) -> None:
-    if name in ("foreign_env", "foreign_robosuite", "gym_env", "own_vector_env"):
+    if name in ("foreign_env", "foreign_robosuite", "gym_env", "own_vector_env", "record_lerobot"):
         pytest.importorskip("gymnasium")
     command = [sys.executable, str(ROOT / "examples" / f"{name}.py")]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
