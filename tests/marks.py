@@ -48,6 +48,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "test_doctor.py",
         "test_press_end_to_end.py",
         "test_render.py",
+        "test_show.py",
         "view/test_view_command.py",
     ),
     "solver": (
@@ -86,6 +87,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "test_device.py",
         "test_fuzz_inputs.py",
         "test_render.py",
+        "test_show.py",
         "test_sensor.py",
         "test_sensor_soft.py",
         "test_threads.py",

@@ -1,4 +1,4 @@
-"""Progress of long work: a bar on a terminal or in a notebook, elsewhere a line now and then."""
+"""Progress of long work: a bar on a terminal or in a notebook, elsewhere lines."""
 
 from __future__ import annotations
 
