@@ -13,10 +13,12 @@ ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 SAYS = {
     "batch": "load",
+    "depth_map": "as it is: the ball changes",
     "foreign_env": "right: pad pressed by 3.0",
     "foreign_loop": "the ball weighs 0.98",
     "gym_env": "return after five random actions",
     "own_mujoco_model": "right: normal force",
+    "own_part": "leaning: touches at x = ",
     "own_vector_env": "force on each cube",
     "press": "force",
     "relight": "without blue",
