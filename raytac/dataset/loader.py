@@ -99,7 +99,7 @@ class PressDataset:
         arrays = self.description["arrays"]
         rows = {
             "folder": self.folder,
-            "presses": f"{len(self)} sound ones",
+            "presses": f"{len(self)}, without those that failed",
             "sensors": ", ".join(self.description["sensors"]),
             "arrays": ", ".join(f"{name} {item['dtype']}" for name, item in arrays.items()),
         }
