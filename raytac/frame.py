@@ -5,15 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from pathlib import Path
 from threading import RLock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from raytac.errors import InputError
+from raytac.checks import check_whole
+from raytac.errors import BackendError, InputError
 from raytac.gel.surface import GelSurface, summary
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from raytac.markers import MarkerFrame
 
 __all__ = ["IMAGES", "OUTPUTS", "MissingOutputError", "TactileFrame"]
@@ -167,3 +171,134 @@ class TactileFrame:
 
     def __repr__(self) -> str:
         return summary(self, self.outputs)
+
+    def show(self, env: int = 0) -> Figure:
+        """Draw one environment: image with markers, indentation, normals, depth, pressure.
+
+        What is not there is left out. In a notebook the figure appears where the call is a cell's last line; with a windowing backend of
+        matplotlib a window opens, and the call returns when it is closed.
+
+        Raises:
+            InputError: an environment that does not exist.
+            BackendError: matplotlib is not installed.
+        """
+        env = check_whole("env", env, 0, self.surface.batch - 1)
+        try:
+            from matplotlib import pyplot
+        except ImportError as error:
+            raise BackendError(f"show() needs matplotlib ({error}): `pip install matplotlib`; save() works without") from error
+        panels = self._panels(env)
+        figure, places = pyplot.subplots(1, len(panels), figsize=(3.4 * len(panels), 3.2), layout="constrained", squeeze=False)
+        for axes, (caption, image, settings) in zip(places[0], panels, strict=True):
+            drawn = axes.imshow(image, **settings)
+            axes.set_title(caption, fontsize=9)
+            axes.tick_params(labelsize=7)
+            if image.ndim == 2:
+                figure.colorbar(drawn, ax=axes, shrink=0.8).ax.tick_params(labelsize=7)
+            if caption == "image" and "markers" in self.outputs:
+                (u, v), (du, dv) = self.markers.rest_px[env].T, self.markers.displacement_px[env].T
+                axes.quiver(u, v, du, dv, color="white", angles="xy", scale_units="xy", scale=0.2, width=0.006)
+                axes.set_title("image; arrows: markers × 5", fontsize=9)
+        figure.suptitle(self._title(env), fontsize=9)
+        if pyplot.get_backend().lower() in {"qtagg", "tkagg", "gtk3agg", "gtk4agg", "wxagg", "macosx", "qt5agg"}:
+            pyplot.show()
+        pyplot.close(figure)  # a notebook would show it twice
+        return figure
+
+    def save(self, path: str | Path, env: int = 0) -> list[Path]:
+        """Write the frame, and return the files written.
+
+        ``NAME.png`` is the image of environment ``env``. ``NAME.npz`` has every array of all environments under its name, layers and
+        markers as ``layers.red`` and ``markers.displacement``, with the surface's ``height``, ``contact``, ``grid_x`` and ``grid_y``. A
+        path without suffix is a folder with ``frame.npz`` and one image an environment.
+
+        Raises ``InputError``: another suffix, a PNG without image, or a folder that cannot be written.
+        """
+        from raytac.io.arrays import npz_bytes
+        from raytac.io.folder import result_folder
+        from raytac.io.images import png_bytes
+
+        path, many = Path(path), self.surface.batch > 1
+        if path.suffix == ".png":
+            files = {path.name: png_bytes(self.rgb[check_whole("env", env, 0, self.surface.batch - 1)])}
+        elif path.suffix == ".npz":
+            files = {path.name: npz_bytes(self._arrays())}
+        elif path.suffix:
+            raise InputError("path", value=path, rule="must end in .png or .npz, or be a folder without a suffix")
+        else:
+            files = {"frame.npz": npz_bytes(self._arrays())}
+            for k, image in enumerate(self.rgb if "rgb" in self.outputs else ()):
+                files[f"rgb_{k:03d}.png" if many else "rgb.png"] = png_bytes(image)
+        out = path.parent if path.suffix else path
+        with result_folder(out) as folder:
+            for name, data in files.items():
+                (folder / name).write_bytes(data)
+        return [out / name for name in files]
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """Every array that is there, by a dotted name."""
+        grid = self.surface.grid
+        arrays = {"grid_x": grid.x, "grid_y": grid.y, "height": self.surface.height, "contact_on_grid": self.surface.contact}
+        for name in self.outputs:
+            value = getattr(self, name)
+            if isinstance(value, np.ndarray):
+                arrays[name] = value
+            elif name == "layers":
+                arrays |= {f"layers.{layer}": image for layer, image in value.items()}
+            elif name == "markers":
+                arrays |= {f"markers.{f.name}": getattr(value, f.name) for f in fields(value)}
+        return arrays
+
+    def _title(self, env: int) -> str:
+        """Label, environment and force, as far as they are known."""
+        texts = [self.label, f"environment {env} of {self.surface.batch}"] if self.surface.batch > 1 else [self.label]
+        if "force" in self.outputs:
+            texts.append("force {:.2f}, {:.2f}, {:.2f} N".format(*self.force[env]))
+        return " · ".join(text for text in (*texts, "failed" if self.failed[env] else "") if text)
+
+    def _panels(self, env: int) -> list[tuple[str, np.ndarray, dict[str, Any]]]:
+        """Caption, array (H, W) or (H, W, 3), and settings of ``imshow`` of each picture."""
+        surface, grid = self.surface, self.surface.grid
+        extent = [1e3 * value for value in (grid.x[0], grid.x[-1], grid.y[-1], grid.y[0])]
+        panels: list[tuple[str, np.ndarray, dict[str, Any]]] = []
+        if "rgb" in self.outputs:
+            panels.append(("image", self.rgb[env], {}))
+        panels.append(("indentation [mm]", 1e3 * surface.indentation[env], {"extent": extent, "cmap": "viridis"}))
+        if "normals" in self.outputs:
+            towards_camera = self.normals[env] * [1.0, 1.0, -1.0]  # so that flat gel is blue, as normal maps have it
+            panels.append(("normals", np.clip(0.5 + 0.5 * towards_camera, 0.0, 1.0), {}))
+        if "depth" in self.outputs:
+            panels.append(("depth [mm]", 1e3 * self.depth[env], {"cmap": "viridis"}))
+        if "traction" in self.outputs:
+            panels.append(("pressure [kPa]", -1e-3 * self.traction[env, ..., 2], {"extent": extent, "cmap": "magma"}))
+        return panels
+
+    def _repr_html_(self) -> str:
+        """Card for notebooks: forces, outputs, and the pictures of the first environments."""
+        from raytac.io.html import card, coloured, picture
+
+        batch, shown = self.surface.batch, min(self.surface.batch, 4)
+        rows = {"outputs": ", ".join(name for name in self.outputs if name not in ("surface", "failed", "time_ms", "label"))}
+        rows["indentation"] = f"up to {_range(1e3 * self.surface.indentation)[1]:.2f} mm"
+        if self.failed.any():
+            rows["failed"] = f"{int(self.failed.sum())} of {batch} environments"
+        if "force" in self.outputs:
+            rows["force"] = "; ".join("{:.2f}, {:.2f}, {:.2f} N".format(*force) for force in self.force[:shown])
+            rows["force"] += "; …" if batch > shown else ""
+        pictures = ""
+        for env in range(shown):
+            for caption, image, _ in self._panels(env)[: 2 if batch > 1 else None]:
+                if image.ndim == 2:
+                    low, high = _range(image)
+                    caption, image = f"{caption}: {low:.4g} to {high:.4g}", coloured(image, low, high)
+                elif image.dtype != np.uint8:
+                    image = np.round(255.0 * image).astype(np.uint8)
+                pictures += picture(image, caption if batch == 1 else f"{env}: {caption}")
+        title = f"TactileFrame · {self.label}" if self.label else "TactileFrame"
+        return card(title + (f" · {batch} environments" if batch > 1 else ""), rows, pictures)
+
+
+def _range(values: np.ndarray) -> tuple[float, float]:
+    """Least and greatest number that is finite, to 0.001; 0 and 0 without one."""
+    finite = values[np.isfinite(values)]
+    return (0.0, 0.0) if not len(finite) else (round(float(finite.min()), 3) + 0.0, round(float(finite.max()), 3) + 0.0)

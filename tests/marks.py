@@ -51,6 +51,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "test_press_end_to_end.py",
         "test_render.py",
         "test_shipped_sensors.py",
+        "test_show.py",
         "view/test_view_command.py",
     ),
     "solver": (
@@ -94,6 +95,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "test_device.py",
         "test_fuzz_inputs.py",
         "test_render.py",
+        "test_show.py",
         "test_sensor.py",
         "test_sensor_soft.py",
         "test_threads.py",

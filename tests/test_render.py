@@ -128,8 +128,10 @@ def test_a_displaced_surface_keeps_its_contact_rule() -> None:
     assert surface.contact_centre[1] == pytest.approx((grid.x[3], grid.y[2]))
 
 
-@pytest.mark.parametrize("page", ["depth-maps", "own-part"])
-def test_the_pages_run_as_they_are(page: str) -> None:
+@pytest.mark.parametrize("page", ["depth-maps", "own-part", "show-and-save"])
+def test_the_pages_run_as_they_are(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
     blocks = re.findall(r"```python\n(.*?)```", (GUIDE / f"{page}.md").read_text(encoding="utf-8"), flags=re.S)
     assert blocks
     names: dict[str, Any] = {}

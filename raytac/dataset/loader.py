@@ -130,6 +130,30 @@ class PressDataset:
                 sample[name] = np.array(values if name in once else values[row])
         return sample if self._transform is None else self._transform(sample)
 
+    def _repr_html_(self) -> str:
+        """Card for notebooks, with the first presses; of a video its last image."""
+        from raytac.io.html import card, coloured, picture
+
+        arrays = self.description["arrays"]
+        rows = {
+            "folder": self.folder,
+            "presses": f"{len(self)}, without those that failed",
+            "sensors": ", ".join(self.description["sensors"]),
+            "arrays": ", ".join(f"{name} {item['dtype']}" for name, item in arrays.items()),
+        }
+        pictures = ""
+        for i in range(min(len(self), 6)):
+            shard, row = self._shard(self._shards[i]), self._rows[i]
+            caption = f"{self.manifest['index'][i].as_py()}: {self.manifest['object'][i].as_py()}"
+            if "rgb" in arrays:
+                image = np.asarray(shard["rgb"][row])
+                pictures += picture(image[-1] if image.ndim == 4 else image, caption)
+            elif "height" in arrays:
+                height = np.asarray(shard["height"][row], float)
+                dent = shard["rest_height"] - (height[-1] if height.ndim == 3 else height)
+                pictures += picture(coloured(dent, 0.0, float(np.nanmax(dent))), f"{caption}, indentation")
+        return card("PressDataset", rows, pictures)
+
     def shared(self, i: SupportsIndex) -> dict[str, np.ndarray]:
         """Arrays of press ``i``'s shard: grid, height and image at rest. Errors as for ``data[i]``."""
         shard = self._shard(self._shards[self._place(i)])

@@ -142,6 +142,26 @@ class TactileSensor:
         self._is_narrow = False
         """True if this press was warned of already."""
 
+    def _repr_html_(self) -> str:
+        """Card for notebooks; with the image at rest once a renderer is built."""
+        from raytac.io.html import card, picture
+
+        spec, (width, height) = self.spec, self.resolution
+        x, y = (1e3 * side for side in spec.gelpad.size)
+        u, v = (1e3 * n * pitch for n, pitch in zip(self.resolution, spec.camera.pitch_at(self.resolution), strict=True))
+        rows = {
+            "gelpad": f"{x:.1f} × {y:.1f} mm, {1e3 * spec.gelpad.thickness:.1f} mm thick",
+            "image": f"{width} × {height} px, {u:.1f} × {v:.1f} mm of the pad",
+            "lights": f"{len(spec.lights.leds)} LEDs",
+            "physics": "as each scene says" if self.physics is None else self.physics.label,
+            "optics": (self._mode or self.optics).label,
+            "markers": "none" if self.markers is None else MARKERS.name_of(self.markers),
+            "outputs": ", ".join(self.outputs),
+            "environments": self.num_envs,
+        }
+        is_built = self._mode is not None and "rgb" in self.outputs
+        return card(f"TactileSensor · {spec.name}", rows, picture(self.rest().rgb[0], "at rest") if is_built else "")
+
     def __reduce__(self) -> tuple[Any, ...]:
         """A sensor of the same settings.
 

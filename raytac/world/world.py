@@ -213,6 +213,21 @@ class TactileWorld:
         touched = ", ".join(self.composed.bodies)
         return f"TactileWorld({name}, sensors: {sensors}; bodies: {touched}; {self.num_envs} environments, {self.physics.label})"
 
+    def _repr_html_(self) -> str:
+        """Card for notebooks; nothing is computed for it."""
+        from raytac.io.html import card
+
+        rows = {
+            "sensors": ", ".join(self.sensor_names) or "none",
+            "touched bodies": ", ".join(self.composed.bodies) or "none",
+            "joints, actuators": f"{self.model.njnt}, {self.model.nu}",
+            "control step": f"{1e3 * self.control_timestep:g} ms of {1e3 * self.model.opt.timestep:g} ms steps",
+            "physics": self.physics.label,
+            "engine": "MuJoCo" if self.engine is None else "MuJoCo Warp",
+            "environments": self.num_envs,
+        }
+        return card(f"TactileWorld · {'own model' if self.scene is None else self.scene.name}", rows)
+
     def __reduce__(self) -> Any:
         """Raise ``InputError``: MuJoCo's states and recorded kernels belong to one process."""
         raise InputError("world", value=self, rule="cannot be copied or pickled: build one in each process")

@@ -365,3 +365,10 @@ def test_a_contact_sheet_says_what_each_press_is_and_how_deep_with_a_scale(folde
         contact_sheet(data, columns=0)
     with pytest.raises(InputError, match="count = '5'"):
         contact_sheet(data, "5")  # type: ignore[arg-type]
+
+
+def test_a_card_for_notebooks_shows_the_first_presses(folders: dict[bool, Path]) -> None:
+    page = PressDataset(folders[False])._repr_html_()
+    assert (
+        page.count("data:image/png;base64,") == min(len(PressDataset(folders[False])), 6) and "without those that failed" in page
+    )

@@ -14,11 +14,13 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 SAYS = {
     "batch": "load",
     "foreign_depth": "of imprints [0.2 0.4 0.6 0.8] mm deep",
+    "depth_map": "as it is: the ball changes",
     "foreign_env": "right: pad pressed by 3.0",
     "foreign_loop": "the ball weighs 0.98",
     "foreign_robosuite": "left: pad pressed by 3.0",
     "gym_env": "return after five random actions",
     "own_mujoco_model": "right: normal force",
+    "own_part": "leaning: touches at x = ",
     "own_vector_env": "force on each cube",
     "press": "force",
     "record_lerobot": "data/chunk-000/file-000.parquet",

@@ -130,7 +130,7 @@ def test_a_scale_that_cannot_be_meant(tmp_path: Path, scale: float, rule: str) -
     assert f"scale = {scale}: {rule}" in message
 
 
-@given(st.binary(max_size=300), st.sampled_from([".stl", ".obj", ".ply"]))
+@given(st.binary(max_size=300), st.sampled_from([".stl", ".obj", ".ply", ".off", ".glb"]))
 @settings(max_examples=60, deadline=None)
 def test_random_bytes_are_refused_and_nothing_else_is_raised(
     tmp_path_factory: pytest.TempPathFactory, content: bytes, suffix: str

@@ -185,6 +185,16 @@ def test_a_mesh_in_memory_is_pressed_as_its_file(part: Path, sensor: TactileSens
     assert press_of(block, depth=DEPTH) != press_of(trimesh.creation.box((6e-3, 4e-3, 2e-3)), depth=DEPTH)
 
 
+def test_a_glb_is_in_metres_as_its_standard_says(tmp_path: Path) -> None:
+    block = trimesh.creation.box((6e-3, 4e-3, 3e-3))
+    block.export(tmp_path / "part.glb")
+    (part,) = object_parts(press_of(tmp_path / "part.glb", depth=DEPTH).object)
+    assert part.vertices is not None
+    assert np.ptp(part.vertices, axis=0) == pytest.approx((6e-3, 4e-3, 3e-3), rel=1e-6)
+    with pytest.raises(MeshError, match=r"the object is 0\.006 mm long"):
+        press_of(tmp_path / "part.glb", depth=DEPTH, scale=0.001)
+
+
 def test_plain_numbers_place_the_object(sensor: TactileSensor) -> None:
     """A block of 6 × 4 mm, turned by 90°, is 4 × 6 mm; a tilted one touches first with the side that is up in the image."""
     block = trimesh.creation.box((6e-3, 4e-3, 3e-3))

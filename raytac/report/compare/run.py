@@ -114,7 +114,7 @@ def run_comparison(
         modes = chosen_modes(comparison_modes(settings.spp, quick=settings.quick), settings.modes)
     run = _Run(settings, device, RowStore(out / "rows", Progress.write), out / "references", machine())
     scenes = [(size, Path(scene).stem) for size in settings.resolutions for scene in settings.scenes]
-    with Progress(total=len(scenes) * len(modes), desc="compare", unit="row") as bar:
+    with Progress(total=len(scenes) * (len(modes) + 1), desc="compare", unit="step") as bar:
         for k, (size, scene) in enumerate(scenes):
             if size != run.size:
                 run.begin(size, modes, bar)
@@ -202,6 +202,7 @@ class _Run:
         bar.set_postfix_str(f"{size} {name}: reference")
         scene = _Scene(name, self._surfaces[name], self._references, self._tracers, self.size)
         self.images[name, size] = scene.truth
+        bar.update()
         if settings.pad is not None:
             bar.set_postfix_str(f"{size} {name}: soft pad")
             press = next(one for one in settings.scenes if Path(one).stem == name)
