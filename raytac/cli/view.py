@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
@@ -16,16 +17,16 @@ from raytac.markers import MARKERS
 from raytac.optics import OPTICS
 from raytac.physics import PHYSICS, PhysicsConfig
 from raytac.sensor import TactileSensor
-from raytac.specs import PADS, PressScene, TaskScene, load_scene
+from raytac.specs import PADS, PressScene, TaskScene, available, load_scene
 from raytac.specs.sensor_file import sensor_spec
 from raytac.specs.task import COUPLINGS
 from raytac.warp_messages import quiet_warp
 
 if TYPE_CHECKING:
     from raytac.specs.sensor import SensorSpec
-    from raytac.view.session import Session
+    from raytac.view.session import Session, SessionMenu
 
-_OUTPUTS = ("rgb", "wrench", "traction")
+_OUTPUTS = ("rgb", "wrench", "traction", "normals")
 _LONGEST = 320
 """Side of a tactile image [px] that is drawn quickly and large enough to be seen."""
 
@@ -56,6 +57,8 @@ class ViewArgs(ShadowOptions):
     """Control steps from one shown state to the next; 1, or 4 with rigid pads without markers."""
     resolution: str | None = None
     """WIDTHxHEIGHT of the tactile image [px]; the sensor's, scaled to at most 320, if not given."""
+    out: Path = Path("runs/view")
+    """Folder that the page's buttons save to; nothing is written before."""
     host: str = "127.0.0.1"
     """Address to serve at: 127.0.0.1 is this machine, 0.0.0.0 lets everyone move the sliders."""
     allow_host: str | None = None
@@ -85,7 +88,8 @@ class ViewArgs(ShadowOptions):
         if not self.verbose:
             quiet_warp()
         session = self._press(scene, physics) if isinstance(scene, PressScene) else self._task(scene, physics)
-        with Viewer(session, host=self.host, port=self.port, allow_hosts=allowed) as viewer:
+        serving = {"folder": self.out, "host": self.host, "port": self.port, "allow_hosts": allowed}
+        with Viewer(session, menu=self._menu(scene), **serving) as viewer:
             print(f"raytac: {session.title}")
             elsewhere = f"elsewhere: ssh -L {viewer.port}:127.0.0.1:{viewer.port} HOST"
             print(f"raytac: open {viewer.url} ({elsewhere}); Ctrl-C ends", flush=True)
@@ -95,6 +99,24 @@ class ViewArgs(ShadowOptions):
             except KeyboardInterrupt:
                 print("raytac: viewer closed")
         return 0
+
+    def _menu(self, scene: PressScene | TaskScene) -> SessionMenu:
+        """Drop-downs of what is shipped, and of what was named beside."""
+        from raytac.view.session import SessionMenu
+
+        kind, label = ("press scene", "object") if isinstance(scene, PressScene) else ("task scene", "task")
+        sensor = self.sensor or ("gelsight_mini" if isinstance(scene, PressScene) else scene.robot.sensor)
+        chosen = {label: self.scene, "sensor": str(sensor)}
+        shipped = {label: available(kind), "sensor": available("sensor")}
+        options = {name: tuple(dict.fromkeys((*names, chosen[name]))) for name, names in shipped.items()}
+        return SessionMenu(options, chosen, lambda choice: self._session_of(choice[label], choice["sensor"]))
+
+    def _session_of(self, scene: str, sensor: str) -> Session:
+        """Session of another choice in the page; everything else is as on the command line."""
+        loaded = load_scene(scene)
+        physics = chosen_physics(self.physics, self.level, loaded)
+        args = replace(self, scene=scene, sensor=sensor)
+        return args._press(loaded, physics) if isinstance(loaded, PressScene) else args._task(loaded, physics)
 
     def _press(self, scene: PressScene, physics: PhysicsConfig) -> Session:
         from raytac.view.press_session import PressSession

@@ -107,4 +107,6 @@ class PageClient:
         self._send(type="GuiUpdateMessage", uuid=uuid, updates={"value": value})
 
     def press(self, button: str) -> None:
-        self.set(button, button)
+        """Press a button of a group, by its text."""
+        uuid = self.until(lambda: next(uuid for uuid, e in self.elements.items() if button in e.get("options", ())), button)
+        self._send(type="GuiUpdateMessage", uuid=uuid, updates={"value": button})
