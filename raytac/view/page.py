@@ -32,8 +32,8 @@ _MODES = {
     "stopped": "stopped: the program that served this page has ended",
 }
 _COMMANDS = ("Play", "Pause", "Step", "Reset")
-_VIEW_SIZE, _VIEW_PATIENCE, _DECODING = (720, 960), 20.0, 0.1
-"""Height and width [px] of a saved 3-D view, longest wait for it, and for its coats [s]."""
+_VIEW_PATIENCE, _DECODING = 20.0, 0.1
+"""Longest wait for a browser's 3-D view, and for the coats in it [s]."""
 _ALL = "all"
 """Button that takes the eye back to where it began."""
 _ORDER = {
@@ -135,6 +135,8 @@ class Page:
             hint = f"Into {self._saver.folder}, and as a download; all but PNG: every state of the timeline"
             save = gui.add_button_group("save", FORMATS, hint=hint, order=_ORDER["save"])
             save.on_click(self._save)
+            hint = "In what is saved, from where you look; it takes seconds a picture in a browser without a graphics card"
+            self._with_view = gui.add_checkbox("save 3-D view", True, hint=hint, order=_ORDER["save"] + 0.2)
             self._saved = gui.add_html("", visible=False, order=_ORDER["save"] + 0.5)
         self._facts = gui.add_html("", order=_ORDER["facts"])
         gui.main_panel.dock_right()
@@ -218,15 +220,17 @@ class Page:
         self._saved.content = _boxed(text, colour)
         self._redraw()
 
-    def _rendered(self, client: ClientHandle, snapshot: Snapshot) -> np.ndarray | None:
+    def _rendered(self, client: ClientHandle, snapshot: Snapshot, height: int) -> np.ndarray | None:
         """The 3-D view of a state as a browser sees it, (H, W, 3); None if it does not answer."""
+        if not self._with_view.value:
+            return None
         with self._drawing:
             with self._server.atomic():
                 self._view.draw(snapshot, self._scales, self._labels[self._quantity.value])
             self._server.flush()
             time.sleep(_DECODING)
             try:
-                return client.get_render(*_VIEW_SIZE, timeout=_VIEW_PATIENCE)
+                return client.get_render(height, height * 4 // 3, timeout=_VIEW_PATIENCE)
             except (TimeoutError, RuntimeError):
                 return None
 

@@ -25,7 +25,9 @@ _LEAST_RANGE = 1e-4
 
 def pictures_of(pads: Mapping[str, PadView]) -> tuple[str, ...]:
     """Pictures that some of the pads have; all, without pads."""
-    return PICTURES if not pads else tuple(kind for kind in PICTURES if any(_source(pad, kind) is not None for pad in pads.values()))
+    return (
+        PICTURES if not pads else tuple(kind for kind in PICTURES if any(_source(pad, kind) is not None for pad in pads.values()))
+    )
 
 
 def _source(pad: PadView, kind: str) -> np.ndarray | None:
@@ -56,7 +58,8 @@ class HeightScale:
     @property
     def label(self) -> str:
         """Range in words, for people."""
-        return f"z from {1e3 * self.low:.2f} mm (dark) to {1e3 * self.high:.2f} mm (bright)"
+        low, high = (round(1e3 * end, 2) + 0.0 for end in (self.low, self.high))
+        return f"z from {low:.2f} mm (dark) to {high:.2f} mm (bright)"
 
 
 def picture(
@@ -97,13 +100,22 @@ def _coloured(pad: PadView, heights: HeightScale | None) -> np.ndarray:
     return np.rint(255.0 * colormaps["viridis"](np.clip(share, 0.0, 1.0))[..., :3]).astype(np.uint8)
 
 
-def _with_arrows(image: np.ndarray, rest: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    from PIL import Image, ImageDraw
+def enlarged(image: np.ndarray) -> np.ndarray:
+    """An 8-bit image (H, W, 3), larger by the whole factor that makes it wide enough for a page."""
+    from PIL import Image
 
     height, width = image.shape[:2]
     factor = -(-_LEAST_WIDTH // width)
-    large = Image.fromarray(image).resize((factor * width, factor * height), Image.Resampling.BILINEAR)
-    draw = ImageDraw.Draw(large)
+    if factor == 1:
+        return image
+    return np.asarray(Image.fromarray(image).resize((factor * width, factor * height), Image.Resampling.BILINEAR))
+
+
+def _with_arrows(image: np.ndarray, rest: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    from PIL import Image, ImageDraw
+
+    large = Image.fromarray(enlarged(image))
+    factor, draw = large.width // image.shape[1], ImageDraw.Draw(large)
     starts, arrows_px = factor * rest, factor * ARROW_SCALE * moved
     for (x, y), (dx, dy) in zip(starts, arrows_px, strict=True):
         if not np.isfinite([x, y, dx, dy]).all():
@@ -121,12 +133,20 @@ def _with_arrows(image: np.ndarray, rest: np.ndarray, moved: np.ndarray) -> np.n
     return np.asarray(large)
 
 
-_FILM_HEIGHT, _CAPTION, _GAP = 360, 26, 8
-"""Height of the pictures of a film, of the text below them, and the space between [px]."""
+FILM_HEIGHT, STILL_HEIGHT = 360, 720
+"""Height of the pictures of a film, and of a single one [px]."""
+_CAPTION, _GAP = 26, 8
+"""Height of the text below pictures, and the space between them [px]."""
 
 
 def film_picture(
-    snapshot: Snapshot, kind: str, *, arrows: bool, heights: HeightScale, view: np.ndarray | None = None
+    snapshot: Snapshot,
+    kind: str,
+    *,
+    arrows: bool,
+    heights: HeightScale,
+    view: np.ndarray | None = None,
+    height: int = FILM_HEIGHT,
 ) -> np.ndarray:
     """One picture of a film: the 3-D view if there is one, then every pad with its force.
 
@@ -139,19 +159,16 @@ def film_picture(
         image = picture(pad, kind, arrows=arrows, heights=heights)
         if image is not None:
             panels.append((image, f"{name}   {_force(pad)}"))
-    sized = [Image.fromarray(image).resize((_width(image), _FILM_HEIGHT), Image.Resampling.LANCZOS) for image, _ in panels]
+    sizes = [(max(2, round(image.shape[1] * height / image.shape[0])), height) for image, _ in panels]
+    sized = [Image.fromarray(panel[0]).resize(size, Image.Resampling.LANCZOS) for panel, size in zip(panels, sizes, strict=True)]
     width = sum(image.width for image in sized) + _GAP * (len(sized) + 1)
-    sheet = Image.new("RGB", (width + width % 2, _FILM_HEIGHT + 2 * _GAP + _CAPTION), (250, 250, 250))
+    sheet = Image.new("RGB", (width + width % 2, height + 2 * _GAP + _CAPTION), (250, 250, 250))
     draw, x = ImageDraw.Draw(sheet), _GAP
     for image, (_, text) in zip(sized, panels, strict=True):
         sheet.paste(image, (x, _GAP))
-        draw.text((x + 2, _FILM_HEIGHT + _GAP + 5), text, fill=(40, 40, 40), font_size=14)
+        draw.text((x + 2, height + _GAP + 5), text, fill=(40, 40, 40), font_size=14)
         x += image.width + _GAP
     return np.asarray(sheet)
-
-
-def _width(image: np.ndarray) -> int:
-    return max(2, round(image.shape[1] * _FILM_HEIGHT / image.shape[0]))
 
 
 def _clock(snapshot: Snapshot) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 
 from raytac.errors import BackendError, RaytacError
 from raytac.io import write_atomic
-from raytac.view.pictures import HeightScale, film_picture, films_equal_size
+from raytac.view.pictures import FILM_HEIGHT, STILL_HEIGHT, HeightScale, film_picture, films_equal_size
 from raytac.view.recording import recording_bytes
 from raytac.view.session import Session, Snapshot
 
@@ -27,8 +27,8 @@ _FILM_S, _FASTEST = 8.0, 20.0
 """Longest film [s] without simulated time, and most pictures a second."""
 _GOOD, _BAD = "#1b6e3c", "#b3261e"
 
-View = Callable[[Snapshot], np.ndarray | None]
-"""The 3-D view of a state, (H, W, 3), as the browser of who saves draws it; None without."""
+View = Callable[[Snapshot, int], np.ndarray | None]
+"""The 3-D view of a state, so many pixels high, (H, W, 3), by the user's browser; or None."""
 
 
 class Saver:
@@ -75,7 +75,7 @@ class Saver:
             path = self._path(session.title, suffix)
             path.parent.mkdir(parents=True, exist_ok=True)
             write_atomic(path, data)
-            client.send_file_download(path.name, data)
+            client.send_file_download(path.name, data, save_immediately=True)
             count = "1 state" if len(chosen) == 1 else f"{len(chosen)} states"
             return f"{path} ({count}, {len(data) / 1e6:.1f} MB)", _GOOD
         except (RaytacError, OSError) as error:
@@ -94,7 +94,9 @@ class Saver:
         for state in states:
             for pad in state.pads.values():
                 heights.include(pad)
-        drawn = [film_picture(state, picture, arrows=arrows, heights=heights, view=view(state)) for state in states]
+        height = STILL_HEIGHT if kind == "PNG" else FILM_HEIGHT
+        look = {"arrows": arrows, "heights": heights, "height": height}
+        drawn = [film_picture(state, picture, view=view(state, height), **look) for state in states]
         if kind == "PNG":
             stream = io.BytesIO()
             Image.fromarray(drawn[0]).save(stream, "PNG")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from raytac.view.history import History
-from raytac.view.pictures import ARROW_SCALE, PICTURES, HeightScale, picture, pictures_of
+from raytac.view.pictures import ARROW_SCALE, HeightScale, enlarged, picture, pictures_of
 from raytac.view.session import PadView, Session, Snapshot
 
 if TYPE_CHECKING:
@@ -33,11 +33,13 @@ class SensorsPanel:
     def __init__(self, server: ViserServer, session: Session, redraw: Callable[[], None]) -> None:
         """Build the panel, empty; ``redraw`` is called when users choose other pictures."""
         gui, self._session = server.gui, session
+        self._server = server
         self.heights = HeightScale()
         self._images, self._wrenches = {}, {}
         self._plots: dict[tuple[str, str], GuiUplotHandle] = {}
         self._panel = gui.add_panel()
-        with self._panel.add_tab("Sensors" if len(session.pads) > 1 else "Sensor"):
+        self._tab = self._panel.add_tab("Sensors" if len(session.pads) > 1 else "Sensor")
+        with self._tab:
             self._kind = gui.add_dropdown("picture", pictures_of({}), visible=False)
             self._range = gui.add_html("", visible=False)
             for pad in session.pads:
@@ -49,9 +51,6 @@ class SensorsPanel:
             )
             self._signs = gui.add_html(_SIGNS, visible=False)
             self._over_time = gui.add_checkbox("plots", True, visible=False, hint="Force and markers over time")
-            for pad in session.pads:
-                for name, curves in _PLOTS.items():
-                    self._plots[pad.name, name] = self._plot(server, pad.name, name, curves)
         for element in (self._kind, self._arrows, self._over_time):
             element.on_update(lambda _: redraw())
         self._panel.dock_left()
@@ -81,7 +80,7 @@ class SensorsPanel:
             self.heights.include(view)
             image = picture(view, self.kind, arrows=self.arrows, heights=self.heights)
             if image is not None:
-                self._images[name].image = image
+                self._images[name].image = enlarged(image)
                 self._images[name].visible = True
             self._wrenches[name].content = _wrench_html(view)
         self._range.visible = self.kind == "height" and bool(kinds)
@@ -95,34 +94,43 @@ class SensorsPanel:
         stride = -(-len(history) // _MOST_POINTS)
         x = history.x[::stride] if len(history) else np.zeros(0)
         self._over_time.visible = len(history) > 1
-        for (pad, name), plot in self._plots.items():
-            values = history.forces(pad) if name == "force [N]" else history.displacements(pad)
-            has_some = len(x) > 1 and bool(np.isfinite(values).any())
-            plot.visible = has_some and self._over_time.value
-            if plot.visible:
-                plot.data = (x, *(np.asarray(curve[::stride], float) for curve in values))
+        for pad in (pad.name for pad in self._session.pads):
+            for name in _PLOTS:
+                values = history.forces(pad) if name == "force [N]" else history.displacements(pad)
+                is_shown = self._over_time.value and len(x) > 1 and bool(np.isfinite(values).any())
+                if is_shown:
+                    self._plot(pad, name, history.x_label).data = (x, *(curve[::stride].copy() for curve in values))
+                if (pad, name) in self._plots:
+                    self._plots[pad, name].visible = is_shown
 
-    def _plot(self, server: ViserServer, pad: str, name: str, curves: tuple[str, ...]) -> GuiUplotHandle:
-        series: list[Any] = [{"label": "state, or time [s]"}]
+    def _plot(self, pad: str, name: str, x_label: str) -> GuiUplotHandle:
+        """The plot of a pad, made when there is something to show."""
+        if (pad, name) not in self._plots:
+            with self._tab:
+                self._plots[pad, name] = self._empty_plot(f"{pad}: {name}", _PLOTS[name], x_label)
+        return self._plots[pad, name]
+
+    def _empty_plot(self, title: str, curves: tuple[str, ...], x_label: str) -> GuiUplotHandle:
+        series: list[Any] = [{"label": x_label}]
         series += [
-            {"label": curve, "stroke": colour, "width": 2} for curve, colour in zip(curves, _COLOURS[-len(curves) :], strict=True)
+            {"label": curve, "stroke": colour, "width": 2, "points": {"show": False}}
+            for curve, colour in zip(curves, _COLOURS[-len(curves) :], strict=True)
         ]
         empty = tuple(np.array([0.0, 1.0]) for _ in series)
-        return server.gui.add_uplot(
-            empty,
-            tuple(series),
-            title=f"{pad}: {name}",
-            scales={"x": {"time": False}},
-            aspect=1.9,
-            visible=False,
-        )
+        scales: Any = {"x": {"time": False}}
+        return self._server.gui.add_uplot(empty, tuple(series), title=title, scales=scales, aspect=1.9, padding=(14, 14, 0, 0))
 
 
 def _wrench_html(view: PadView) -> str:
     if view.wrench is None or not np.isfinite(view.wrench).all():
         return ""
-    force = [(f"F<sub>{axis}</sub>", f"{value + 0.0:+.3f} N") for axis, value in zip(_AXES, view.wrench[:3], strict=True)]
-    torque = [(f"T<sub>{axis}</sub>", f"{1e3 * value:+.2f} N mm") for axis, value in zip(_AXES, view.wrench[3:], strict=True)]
+    force = [
+        (f"F<sub>{axis}</sub>", f"{round(value, 3) + 0.0:+.3f} N") for axis, value in zip(_AXES, view.wrench[:3], strict=True)
+    ]
+    torque = [
+        (f"T<sub>{axis}</sub>", f"{round(1e3 * value, 2) + 0.0:+.2f} N mm")
+        for axis, value in zip(_AXES, view.wrench[3:], strict=True)
+    ]
     rows = "".join(
         f"<tr><td>{a}</td><td style='{RIGHT}'>{b}</td><td style='padding-left:1.5em'>{c}</td><td style='{RIGHT}'>{d}</td></tr>"
         for (a, b), (c, d) in zip(force, torque, strict=True)
