@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -156,7 +157,7 @@ def read_recording(path: str | Path) -> StatesSession:
             raise ValueError("a state is no state")
     except FileNotFoundError as error:
         raise InputError("recording", value=str(path), rule="must be a file that exists") from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, BadZipFile) as error:
         raise InputError("recording", value=str(path), rule=f"{rule} ({error})") from error
     return StatesSession(stage, states)
 

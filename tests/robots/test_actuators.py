@@ -14,9 +14,11 @@ MODEL = """<mujoco><compiler angle="radian"/><worldbody><body><geom size=".1" ma
 <joint name="bend" axis="1 0 0" range="-0.5 0.5"/></body></body></worldbody>
 <tendon><fixed name="both"><joint joint="free_turn" coef="1"/><joint joint="bend" coef="1"/></fixed></tendon>
 <actuator><position name="aim" joint="turn" kp="10"/><position joint="slide" kp="10" ctrlrange="-0.01 0.02"/>
-<velocity name="speed" joint="turn" kv="1"/><motor joint="free_turn" forcerange="-5 5"/><motor joint="free_turn" ctrlrange="-1 1"/>
+<velocity name="speed" joint="turn" kv="1"/><motor joint="free_turn" forcerange="-5 5"/>
+<motor joint="free_turn" ctrlrange="-1 1"/>
 <motor name="geared" joint="bend" gear="7"/><position name="pull" tendon="both" kp="3"/>
-<intvelocity name="creep" joint="slide" kp="4" actrange="-1 1"/><general name="arm" tendon="both" gainprm="2" ctrlrange="0 1"/></actuator></mujoco>"""
+<intvelocity name="creep" joint="slide" kp="4" actrange="-1 1"/>
+<general name="arm" tendon="both" gainprm="2" ctrlrange="0 1"/></actuator></mujoco>"""
 
 
 def test_each_kind_has_its_unit_its_range_and_a_name():
