@@ -138,7 +138,7 @@ def gif_bytes(pictures: Sequence[np.ndarray], rate: float) -> bytes:
 def check_mp4() -> None:
     """Raise ``BackendError`` if the package that writes MP4 is not installed."""
     if importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise BackendError("MP4 needs imageio-ffmpeg: pip install imageio-ffmpeg; a GIF needs nothing")
+        raise BackendError("MP4 needs imageio-ffmpeg: pip install 'raytac[video]'; a GIF needs nothing")
 
 
 def mp4_bytes(pictures: Sequence[np.ndarray], rate: float) -> bytes:

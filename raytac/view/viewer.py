@@ -65,9 +65,9 @@ class Viewer:
         try:
             if port not in (0, self.port):  # taken since it was checked; viser then goes on to the next
                 raise InputError("port", value=port, rule="is taken; choose another one, or 0 for any that is free")
-            page = Page(self._server, session, menu=menu, saver=None if folder is None else Saver(folder))
-            self.player = Player(session, page.show)
-            page.attach(self.player)
+            self._page = Page(self._server, session, menu=menu, saver=None if folder is None else Saver(folder))
+            self.player = Player(session, self._page.show)
+            self._page.attach(self.player)
             self.player.start()
         except BaseException:
             self._server.stop()

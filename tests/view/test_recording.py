@@ -104,7 +104,7 @@ def test_a_long_film_leaves_states_out_and_mp4_says_what_it_needs(tmp_path, monk
     assert drawn == [MOST_PICTURES]
     monkeypatch.setattr(saving.importlib.util, "find_spec", lambda name: None)
     text, client = save(Saver(tmp_path), "MP4", states(2))
-    assert "pip install imageio-ffmpeg" in text and not client.files
+    assert "pip install 'raytac[video]'" in text and not client.files
     with pytest.raises(BackendError):
         mp4_bytes([np.zeros((4, 4, 3), np.uint8)], 5.0)
 
