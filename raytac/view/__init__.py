@@ -1,4 +1,4 @@
-"""A scene in the browser: ``raytac view SCENE`` (docs/guide/viewer.md); needs ``raytac[view]``."""
+"""A scene in the browser: ``raytac view`` (docs/guide/viewer.md); needs ``raytac[view]``."""
 
 import lazy_loader
 

@@ -218,6 +218,7 @@ class Page:
         view, session = partial(self._rendered, event.client), self._session
         text, colour = self._saver.save(event.target.value, session, shown, states, view=view, client=event.client, **look)
         self._saved.content = _boxed(text, colour)
+        self._controls.show_handle(self._with_handle.value)
         self._redraw()
 
     def _rendered(self, client: ClientHandle, snapshot: Snapshot, height: int) -> np.ndarray | None:
@@ -226,6 +227,7 @@ class Page:
             return None
         with self._drawing:
             with self._server.atomic():
+                self._controls.show_handle(False)
                 self._view.draw(snapshot, self._scales, self._labels[self._quantity.value])
             self._server.flush()
             time.sleep(_DECODING)
