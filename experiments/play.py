@@ -33,9 +33,9 @@ from raytac.optics import OPTICS
 from raytac.report import machine
 
 if TYPE_CHECKING:
-    from experiments.flat_policy import FlatPolicy
     from experiments.ppo_learner import Recipe
     from experiments.training import Evaluation
+    from raytac.envs import FlatPolicy
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +123,7 @@ def _flat(args: Args) -> FlatPolicy | None:
     """The policy, if ``train_gpu.py`` has written it."""
     if args.policy == "scripted":
         return None
-    from experiments.flat_policy import FlatPolicy
+    from raytac.envs import FlatPolicy
 
     return FlatPolicy(Path(args.policy)) if FlatPolicy.is_one(Path(args.policy)) else None
 

@@ -4,28 +4,30 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from raytac.checks import check_whole
+from raytac.checks import check_known, check_whole
 from raytac.cli.shared import ShadowOptions, chosen_physics, named
 from raytac.errors import InputError
 from raytac.io.options import DeviceName, parse_names, parse_resolution
 from raytac.markers import MARKERS
+from raytac.observe import ObservationSettings
 from raytac.optics import OPTICS
 from raytac.physics import PHYSICS, PhysicsConfig
 from raytac.sensor import TactileSensor
-from raytac.specs import PADS, PressScene, TaskScene, load_scene
+from raytac.specs import PADS, PressScene, TaskScene, available, load_scene
 from raytac.specs.sensor_file import sensor_spec
 from raytac.specs.task import COUPLINGS
 from raytac.warp_messages import quiet_warp
 
 if TYPE_CHECKING:
     from raytac.specs.sensor import SensorSpec
-    from raytac.view.session import Session
+    from raytac.view.session import Session, SessionMenu
 
-_OUTPUTS = ("rgb", "wrench", "traction")
+_OUTPUTS = ("rgb", "wrench", "traction", "normals")
 _LONGEST = 320
 """Side of a tactile image [px] that is drawn quickly and large enough to be seen."""
 
@@ -39,7 +41,12 @@ class ViewArgs(ShadowOptions):
     """
 
     scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """Name of a shipped press or task, such as sphere or lift_cube, or path of a scene file."""
+    """Name of a shipped press or task, such as sphere or lift_cube, or path of a scene file.
+
+    A recording (.npz) that the page has saved, the folder of a data set, and a policy (.pt) are played. With --policy: a task's name, as
+    LiftCube."""
+    policy: Annotated[str | None, named(("scripted",))] = None
+    """Policy that plays the task SCENE: scripted, which is written by hand."""
     sensor: str | None = None
     """Name of a shipped sensor, or path of a file; the task's, or gelsight_mini, if not given."""
     physics: Annotated[str | None, named(PHYSICS.names)] = None
@@ -56,6 +63,8 @@ class ViewArgs(ShadowOptions):
     """Control steps from one shown state to the next; 1, or 4 with rigid pads without markers."""
     resolution: str | None = None
     """WIDTHxHEIGHT of the tactile image [px]; the sensor's, scaled to at most 320, if not given."""
+    out: Path = Path("runs/view")
+    """Folder that the page's buttons save to; nothing is written before."""
     host: str = "127.0.0.1"
     """Address to serve at: 127.0.0.1 is this machine, 0.0.0.0 lets everyone move the sliders."""
     allow_host: str | None = None
@@ -80,12 +89,16 @@ class ViewArgs(ShadowOptions):
         allowed = () if self.allow_host is None else parse_names(self.allow_host, "allow_host")
         check_address(self.host, self.port, allowed)
         OPTICS.config(self.optics, **self.chosen_shadows())
-        scene = load_scene(self.scene)
-        physics = chosen_physics(self.physics, self.level, scene)
-        if not self.verbose:
-            quiet_warp()
-        session = self._press(scene, physics) if isinstance(scene, PressScene) else self._task(scene, physics)
-        with Viewer(session, host=self.host, port=self.port, allow_hosts=allowed) as viewer:
+        session, menu = self._played(), None
+        if session is None:
+            scene = load_scene(self.scene)
+            physics = chosen_physics(self.physics, self.level, scene)
+            if not self.verbose:
+                quiet_warp()
+            session = self._press(scene, physics) if isinstance(scene, PressScene) else self._task(scene, physics)
+            menu = self._menu(scene)
+        serving = {"folder": self.out, "host": self.host, "port": self.port, "allow_hosts": allowed}
+        with Viewer(session, menu=menu, **serving) as viewer:
             print(f"raytac: {session.title}")
             elsewhere = f"elsewhere: ssh -L {viewer.port}:127.0.0.1:{viewer.port} HOST"
             print(f"raytac: open {viewer.url} ({elsewhere}); Ctrl-C ends", flush=True)
@@ -95,6 +108,59 @@ class ViewArgs(ShadowOptions):
             except KeyboardInterrupt:
                 print("raytac: viewer closed")
         return 0
+
+    def _played(self) -> Session | None:
+        """Session of a recording, a data set or a policy; None of a scene."""
+        path = Path(self.scene)
+        is_policy = self.policy is not None or path.suffix == ".pt"
+        if not is_policy and path.suffix != ".npz" and not (path.is_dir() and (path / "dataset.json").exists()):
+            return None
+        own = {
+            "sensor": self.sensor,
+            "level": self.level,
+            "markers": self.markers,
+            "coupling": self.coupling,
+            "steps": self.steps,
+        }
+        own |= {} if is_policy else {"physics": self.physics, "resolution": self.resolution}
+        for name, value in own.items():
+            if value is not None:
+                raise InputError(name, value=value, rule=f"is a setting of scenes; {self.scene!r} is played as it is")
+        if path.suffix == ".npz":
+            from raytac.view.recording import read_recording
+
+            return read_recording(path)
+        from raytac.cli.played import dataset_session, policy_session, scripted_session
+
+        if not is_policy:
+            return dataset_session(path)
+        if self.policy is not None:
+            check_known("policy", self.policy, ("scripted",))
+        if not self.verbose:
+            quiet_warp()
+        resolution = (_LONGEST, _LONGEST * 3 // 4) if self.resolution is None else parse_resolution(self.resolution)
+        optics = OPTICS.config(self.optics, **self.chosen_shadows())
+        shown = ObservationSettings(("rgb", "markers", "wrench"), resolution=resolution, optics=optics)
+        settings = {"shown": shown, "device": self.device, "physics": self.physics}
+        return scripted_session(self.scene, **settings) if path.suffix != ".pt" else policy_session(path, **settings)
+
+    def _menu(self, scene: PressScene | TaskScene) -> SessionMenu:
+        """Drop-downs of what is shipped, and of what was named beside."""
+        from raytac.view.session import SessionMenu
+
+        kind, label = ("press scene", "object") if isinstance(scene, PressScene) else ("task scene", "task")
+        sensor = self.sensor or ("gelsight_mini" if isinstance(scene, PressScene) else scene.robot.sensor)
+        chosen = {label: self.scene, "sensor": str(sensor)}
+        shipped = {label: available(kind), "sensor": available("sensor")}
+        options = {name: tuple(dict.fromkeys((*names, chosen[name]))) for name, names in shipped.items()}
+        return SessionMenu(options, chosen, lambda choice: self._session_of(choice[label], choice["sensor"]))
+
+    def _session_of(self, scene: str, sensor: str) -> Session:
+        """Session of another choice in the page; everything else is as on the command line."""
+        loaded = load_scene(scene)
+        physics = chosen_physics(self.physics, self.level, loaded)
+        args = replace(self, scene=scene, sensor=sensor)
+        return args._press(loaded, physics) if isinstance(loaded, PressScene) else args._task(loaded, physics)
 
     def _press(self, scene: PressScene, physics: PhysicsConfig) -> Session:
         from raytac.view.press_session import PressSession

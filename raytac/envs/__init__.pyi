@@ -6,6 +6,8 @@ from .batch import TaskBatch as TaskBatch
 from .environments import TactileEnv as TactileEnv
 from .environments import TactileVectorEnv as TactileVectorEnv
 from .flat import FlatVector as FlatVector
+from .flat_policy import FlatPolicy as FlatPolicy
+from .flat_policy import read_tensors as read_tensors
 from .insert_peg import InsertPeg as InsertPeg
 from .insert_peg import InsertPegEnv as InsertPegEnv
 from .insert_peg import InsertPegVectorEnv as InsertPegVectorEnv

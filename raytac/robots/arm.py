@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 
 from raytac.errors import InputError
+from raytac.robots.actuators import force_limits, torque_motors
 from raytac.robots.frames import world_from_site
 from raytac.robots.states import Numbers, numbers, site_pose
 
@@ -52,8 +53,8 @@ class Arm:
         self.qpos, self.dof = model.jnt_qposadr[ids].copy(), model.jnt_dofadr[ids].copy()
         self.range = np.where(model.jnt_limited[ids, None] == 1, model.jnt_range[ids], (-np.inf, np.inf))
         self.slides = model.jnt_type[ids] == int(mujoco.mjtJoint.mjJNT_SLIDE)
-        self.motors = _motors(model, ids)
-        self.torque_limit = None if self.motors is None else _limits(model, self.motors)
+        self.motors = torque_motors(model, ids)
+        self.torque_limit = None if self.motors is None else force_limits(model, self.motors)
 
     def __len__(self) -> int:
         return len(self.joints)
@@ -136,28 +137,3 @@ def _ancestors(model: mujoco.MjModel, body: int) -> set[int]:
         body = int(model.body_parentid[body])
         ancestors.add(body)
     return ancestors
-
-
-def _motors(model: mujoco.MjModel, joints: Iterable[int]) -> np.ndarray | None:
-    """Torque motor of each joint (unit gain and gear, no bias or activation), or None."""
-    motors = []
-    for joint in joints:
-        plain = (
-            (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
-            & (model.actuator_trnid[:, 0] == joint)
-            & (model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED))
-            & (model.actuator_gainprm[:, 0] == 1.0)
-            & (model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE))
-            & (model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_NONE))
-            & (model.actuator_gear[:, 0] == 1.0)
-        )
-        if plain.sum() != 1:
-            return None
-        motors.append(int(np.flatnonzero(plain)[0]))
-    return np.array(motors)
-
-
-def _limits(model: mujoco.MjModel, motors: np.ndarray) -> np.ndarray:
-    ctrl = np.where(model.actuator_ctrllimited[motors, None] == 1, model.actuator_ctrlrange[motors], (-np.inf, np.inf))
-    force = np.where(model.actuator_forcelimited[motors, None] == 1, model.actuator_forcerange[motors], (-np.inf, np.inf))
-    return np.stack([np.maximum(ctrl[:, 0], force[:, 0]), np.minimum(ctrl[:, 1], force[:, 1])], axis=1)

@@ -1,4 +1,4 @@
-"""A scene in the browser, by ``raytac view SCENE`` (docs/guide/viewer.md)."""
+"""A scene in the browser: ``raytac view`` (docs/guide/viewer.md); needs ``raytac[view]``."""
 
 import lazy_loader
 

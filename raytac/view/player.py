@@ -22,7 +22,7 @@ class Status:
     """State of the player."""
 
     mode: str = "starting"
-    """``starting``, ``paused``, ``playing``, ``driving`` (to controls' targets) or ``stopped``."""
+    """``starting``, ``loading``, ``paused``, ``playing``, ``driving`` or ``stopped``."""
     states_per_s: float = 0.0
     """States computed, imaged and handed out a second, smoothed; 0 when nothing moves."""
     count: int = 0
@@ -49,11 +49,12 @@ class Player:
     def __init__(self, session: Session, show: Callable[[Snapshot | None, Status], None]) -> None:
         """``show(snapshot, status)`` is called in the player's thread; None: only status changed."""
         self._session, self._show = session, show
-        self._names = tuple(control.name for control in session.controls)
         self._wakeup = threading.Condition()
         self._targets: dict[str, float] = {}
         self._orders: list[str] = ["show"]
-        """``show``, ``play``, ``pause``, ``step``, ``reset`` in the order they came."""
+        """``show``, ``play``, ``pause``, ``step``, ``reset``, ``load`` in the order they came."""
+        self._make: Callable[[], Session] | None = None
+        """Makes the session that the next ``load`` takes."""
         self._is_closing = False
         self._status = Status()
         self._thread = threading.Thread(target=self._work, name="raytac-view-player", daemon=True)
@@ -61,6 +62,11 @@ class Player:
     @property
     def status(self) -> Status:
         return self._status
+
+    @property
+    def session(self) -> Session:
+        """The session that is shown now."""
+        return self._session
 
     def start(self) -> None:
         """Begin: the first state is shown, nothing moves."""
@@ -89,10 +95,19 @@ class Player:
         """Back to the start, paused."""
         self._order("reset")
 
+    def load(self, make: Callable[[], Session]) -> None:
+        """Show the session that ``make`` returns; if that fails, the present one stays as it is."""
+        with self._wakeup:
+            self._targets.clear()
+            self._make = make
+            self._orders = ["load"]  # what was asked of the present session is void
+            self._wakeup.notify()
+
     def drive(self, name: str, value: float) -> None:
         """Take a control to ``value``. Raises ``InputError`` for an unknown control."""
-        if name not in self._names:
-            raise InputError("name", value=name, rule="must be a control of the session", choices=self._names)
+        names = tuple(control.name for control in self._session.controls)
+        if name not in names:
+            raise InputError("name", value=name, rule="must be a control of the session", choices=names)
         with self._wakeup:
             self._targets.pop(name, None)  # the latest goes last: of two that exclude each other it wins
             self._targets[name] = float(value)
@@ -139,6 +154,8 @@ class Player:
         if order == "show":
             self._become("paused")
             return session.snapshot()
+        if order == "load":
+            return self._exchange()
         if order in ("play", "step"):
             session.resume()
             self._become("playing" if order == "play" else "paused")
@@ -155,6 +172,17 @@ class Player:
             return session.snapshot()
         self._become("paused")
         return None
+
+    def _exchange(self) -> Snapshot:
+        """The first state of another session, which is taken only if it has one."""
+        assert self._make is not None
+        self._become("loading")
+        self._show(None, self._status)
+        session = self._make()
+        snapshot = session.snapshot()
+        self._session = session
+        self._become("paused", count=0)
+        return snapshot
 
     def _become(self, mode: str, **changes: int) -> None:
         is_moving = mode in ("playing", "driving")

@@ -23,12 +23,13 @@ from raytac.view.sensor_view import (
     coat_pad,
     narrow_warning,
     pad_view,
+    rest_image,
     sensor_lines,
     sensor_solids,
     square,
     strided,
 )
-from raytac.view.session import CameraPlace, Control, Snapshot, Solid, check_targets, reaching
+from raytac.view.session import CameraPlace, Control, Handle, HandlePlace, Snapshot, Solid, check_targets, reaching, turned_by
 
 _STRIDE_MM, _TURN_DEG, _PUSH = 0.1, 2.0, 0.25
 """Largest change from one state to the next towards a slider's value: [mm], [degrees], [N]."""
@@ -72,7 +73,9 @@ class PressSession:
         size = max(sensor.spec.gelpad.size)
         self.camera = CameraPlace((0.9 * size, -1.75 * size, 1.35 * size), (0.0, 0.0, -0.15 * size))
         self._own_controls = self._make_controls(scene) if self._is_drivable else ()
+        self.handle = Handle(("shear_x", "shear_y", "-depth"), ("", "", "twist")) if self._is_drivable else None
         self._grid = strided(self._pad.grid)
+        self._rest = rest_image(sensor)
         self.pads = (coat_pad(sensor.spec.name, sensor, self._grid),)
         self.solids = (*sensor_solids(sensor.spec), *self._object_solids())
         coat = (coat_lines("coat_mesh"),) if isinstance(self._pad, SoftPad) else ()
@@ -195,7 +198,7 @@ class PressSession:
 
     def _drawn(self, frame: TactileFrame) -> Snapshot:
         name, surface = self._sensor.spec.name, frame.surface
-        pads = {name: pad_view(frame, self._grid, np.eye(4))}
+        pads = {name: pad_view(frame, self._grid, np.eye(4), rest_rgb=self._rest)}
         spent = frame.time_ms  # of a frame whose images were waited for
         poses = {solid.name: self._state.pad_from_object[0] for solid in self.solids if solid.name.startswith("object")}
         reshaped: dict[str, np.ndarray] = {}
@@ -214,7 +217,16 @@ class PressSession:
             facts=self._facts(frame),
             warning=narrow_warning(frame),
             time_ms={"image": sum(spent.values()), **spent},
+            handle=self._handle_place(),
         )
+
+    def _handle_place(self) -> HandlePlace | None:
+        if not self._is_drivable:
+            return None
+        values, pose = self._places(), np.eye(4)
+        pose[:3, :3] = turned_by(np.radians([0.0, 0.0, values["twist"]]))
+        pose[:3, 3] = self._state.pad_from_object[0, :3, 3]
+        return HandlePlace(pose, {**values, "depth": 1e3 * float(self._state.depth[0])})
 
     def _facts(self, frame: TactileFrame) -> dict[str, str]:
         state, surface = self._state, frame.surface

@@ -36,7 +36,7 @@ class SceneView:
         scene, scale = server.scene, self._scale
         scene.set_up_direction("+z")
         scene.world_axes.visible = False
-        scene.add_light_ambient("/ambient", intensity=_AMBIENT)
+        self._light = scene.add_light_ambient("/ambient", intensity=_AMBIENT)
         server.initial_camera.position = scale * np.asarray(session.camera.position)
         server.initial_camera.look_at = scale * np.asarray(session.camera.look_at)
         server.initial_camera.fov = _FIELD_OF_VIEW
@@ -58,6 +58,11 @@ class SceneView:
         self._placed: dict[str, np.ndarray] = {}
         """Pose that each solid and line was drawn at last."""
         self._coats = {}
+
+    def remove(self) -> None:
+        """Take everything out of the scene."""
+        for handle in (self._light, *self._solids.values(), *self._lines.values(), *self._coats.values()):
+            handle.remove()
 
     def look(self, client: ClientHandle, view: PadView | None) -> None:
         """Take a client's eye to a pad, on the side that it looks to; None is back to the start."""
@@ -94,6 +99,9 @@ class SceneView:
                     self._solids[name].vertices = _f32(self._scale * points[self._sources[name]])
                 elif name in self._lines:
                     self._lines[name].points = _f32(self._scale * points)
+            for name, handle in self._solids.items():
+                if handle.visible == (name in snapshot.hidden):
+                    handle.visible = name not in snapshot.hidden
             for name, view in snapshot.pads.items():
                 values = view.values[quantity if quantity in view.values else "indentation"]
                 vertices, colours = self._scale * np.nan_to_num(view.vertices), scales[quantity].colours(values)

@@ -58,9 +58,11 @@ def grid_faces(grid: PadGrid) -> np.ndarray:
     return np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
 
 
-def pad_view(frame: TactileFrame, grid: PadGrid, world_from_pad: np.ndarray, env: int = 0) -> PadView:
+def pad_view(
+    frame: TactileFrame, grid: PadGrid, world_from_pad: np.ndarray, env: int = 0, *, rest_rgb: np.ndarray | None = None
+) -> PadView:
     """View of one environment's frame, its coat at the nodes of ``grid`` (from ``strided``)."""
-    at, height = _places(frame.surface.grid, grid), _thinned_height(frame.surface, grid, env)
+    at, height = places(frame.surface.grid, grid), _thinned_height(frame.surface, grid, env)
     x, y = np.meshgrid(grid.x, grid.y)
     values = {"indentation": (grid.rest - height).ravel()}
     if "traction" in frame.outputs:
@@ -76,7 +78,15 @@ def pad_view(frame: TactileFrame, grid: PadGrid, world_from_pad: np.ndarray, env
         rgb=frame.rgb[env] if "rgb" in frame.outputs else None,
         markers_px=markers,
         wrench=frame.wrench[env] if "wrench" in frame.outputs else None,
+        rest_rgb=rest_rgb,
+        height=frame.position[env, ..., 2] if "position" in frame.outputs else None,
+        normals=frame.normals[env] if "normals" in frame.outputs else None,
     )
+
+
+def rest_image(sensor: TactileSensor) -> np.ndarray | None:
+    """Image of the untouched pad, (H, W, 3), uint8; None of a sensor that makes no images."""
+    return sensor.rest().rgb[0] if "rgb" in sensor.outputs else None
 
 
 def narrow_warning(frame: TactileFrame, env: int = 0) -> str:
@@ -128,11 +138,11 @@ def _on_faces(grid: PadGrid, height: np.ndarray, points: np.ndarray) -> np.ndarr
 
 def _thinned_height(surface: GelSurface, grid: PadGrid, env: int) -> np.ndarray:
     """Height [m] at the nodes of a grid from ``strided``, (Ny, Nx)."""
-    return surface.height[env][_places(surface.grid, grid)].astype(float)
+    return surface.height[env][places(surface.grid, grid)].astype(float)
 
 
-def _places(full: PadGrid, grid: PadGrid) -> tuple[np.ndarray, ...]:
-    """Index of a thinned grid's nodes in arrays (Ny, Nx, ...) of the full one."""
+def places(full: PadGrid, grid: PadGrid) -> tuple[np.ndarray, ...]:
+    """Index of the nodes of a thinned grid in arrays (Ny, Nx, ...) of the full one."""
     return np.ix_(np.searchsorted(full.y, grid.y), np.searchsorted(full.x, grid.x))
 
 

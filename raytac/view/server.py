@@ -53,7 +53,7 @@ def guarded_server(host: str, port: int, addresses: PageAddresses) -> ViserServe
         guards = {
             "process_request": _refuse_others(addresses, process_request),
             "create_connection": _checked_connection(lambda uuid: elements.get(uuid)),
-            "max_size": LARGEST,
+            "max_size": LARGEST_PICTURE,
             "logger": _LOG,
         }
         return websockets.asyncio.server.serve(*args, **{**options, **guards})
@@ -121,7 +121,7 @@ def _checked_connection(element: Callable[[str], Any]) -> type[ServerConnection]
                 return checked_message(await super().recv(decode), element)
             except BadMessage as error:
                 _LOG.warning("raytac: viewer: hung up on %s, which sent a bad message: %s", _who(self), error)
-                await self.close(CloseCode.INVALID_DATA, "bad message")
+                await self.close(error.code, "bad message")
                 assert self.protocol.close_exc is not None
                 raise self.protocol.close_exc from error
             except ConnectionClosed as error:
@@ -154,7 +154,9 @@ _LOG.addFilter(_OneLine())
 
 
 LARGEST = 2**16
-"""Longest message that is taken [bytes]; a camera takes 300."""
+"""Longest message that is taken [bytes], but for pictures; a camera takes 300."""
+LARGEST_PICTURE = 2**21
+"""Longest message with a picture of the 3-D view, which the page has asked for [bytes]."""
 _Number = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 """Of a camera; not NaN. The 3-D view is some units large, whatever it shows."""
 _Vector = tuple[_Number, _Number, _Number]
@@ -162,6 +164,11 @@ _Vector = tuple[_Number, _Number, _Number]
 
 class BadMessage(ValueError):
     """A message that no browser with this page sends."""
+
+    def __init__(self, text: str, code: CloseCode = CloseCode.INVALID_DATA) -> None:
+        """``code``: what the connection is ended with."""
+        super().__init__(text)
+        self.code = code
 
 
 class _Camera(msgspec.Struct, tag="ViewerCameraMessage", forbid_unknown_fields=True):
@@ -193,7 +200,44 @@ class _Update(msgspec.Struct, tag="GuiUpdateMessage", forbid_unknown_fields=True
     updates: _Value
 
 
-_DECODER = msgspec.msgpack.Decoder(_Camera | _Update)
+_Name = Annotated[str, msgspec.Meta(max_length=100)]
+
+
+class _Drag(msgspec.Struct, tag="TransformControlsUpdateMessage", forbid_unknown_fields=True):
+    """Pose that a user has given to the handle of the 3-D view."""
+
+    name: _Name
+    wxyz: tuple[_Number, _Number, _Number, _Number]
+    position: _Vector
+    owner: _Name = ""
+
+    def __post_init__(self) -> None:
+        if not 0.99 < hypot(*self.wxyz) < 1.01:
+            raise ValueError("a rotation must be a unit quaternion")
+
+
+class _DragStart(msgspec.Struct, tag="TransformControlsDragStartMessage", forbid_unknown_fields=True):
+    name: _Name
+    owner: _Name = ""
+
+
+class _DragEnd(msgspec.Struct, tag="TransformControlsDragEndMessage", forbid_unknown_fields=True):
+    name: _Name
+    owner: _Name = ""
+
+
+class _Rendered(msgspec.Struct, tag="GetRenderResponseMessage", forbid_unknown_fields=True):
+    """A picture that the page has asked for; viser drops one of an unknown ``render_uuid``."""
+
+    payload: bytes
+    render_uuid: _Name
+
+    def __post_init__(self) -> None:
+        if not self.payload.startswith(b"\xff\xd8\xff"):
+            raise ValueError("a picture must be a JPEG")
+
+
+_DECODER = msgspec.msgpack.Decoder(_Camera | _Update | _Drag | _DragStart | _DragEnd | _Rendered)
 
 
 def checked_message(raw: bytes | str, element: Callable[[str], Any]) -> bytes:
@@ -211,7 +255,10 @@ def checked_message(raw: bytes | str, element: Callable[[str], Any]) -> bytes:
     try:
         message = _DECODER.decode(raw)
     except msgspec.DecodeError as error:
-        raise BadMessage(one_line(str(error))) from error
+        code = CloseCode.MESSAGE_TOO_BIG if len(raw) > LARGEST else CloseCode.INVALID_DATA
+        raise BadMessage(one_line(str(error)), code) from error
+    if len(raw) > LARGEST and not isinstance(message, _Rendered):
+        raise BadMessage(f"{len(raw)} bytes, {LARGEST} at most", CloseCode.MESSAGE_TOO_BIG)
     if isinstance(message, _Update):
         target, value = element(message.uuid), message.updates.value
         if target is not None and not _fits(target, value):

@@ -7,13 +7,14 @@ are in metres in the session's world frame unless a field says otherwise.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
 
 from raytac.errors import InputError
+from raytac.se3 import rotations
 
 Colour = tuple[int, int, int]
 """8-bit sRGB."""
@@ -86,6 +87,64 @@ def round_up(value: float) -> float:
 
 
 @dataclass(frozen=True)
+class Handle:
+    """Arrows and rings in the 3-D view that move controls in millimetres and degrees.
+
+    Turns are about the world's x, then y, then z, as roll, pitch and yaw.
+    """
+
+    along: tuple[str, str, str] = ("", "", "")
+    """Control of a displacement along x, y, z; empty is none, a minus before it is against."""
+    about: tuple[str, str, str] = ("", "", "")
+    """Control that a turn about x, y, z moves; empty is none."""
+
+    def targets(
+        self, begun: HandlePlace, pose: np.ndarray, controls: Sequence[Control], moved: Collection[str] = ()
+    ) -> dict[str, float]:
+        """Values of the controls for a pose (4, 4), within their ends.
+
+        Args:
+            begun: place of the handle before it was moved.
+            moved: controls that the same hand has moved before; of the others, those that stay are left out.
+        """
+        angles = [begun.values.get(name, 0.0) for name in self.about]
+        turn = pose[:3, :3] @ begun.pose[:3, :3].T @ turned_by(np.radians(angles))
+        turned = np.degrees(turn_angles(turn))
+        distances = 1e3 * (pose[:3, 3] - begun.pose[:3, 3])
+        wanted = {name: float(angle) for name, angle in zip(self.about, turned, strict=True) if name}
+        for name, distance in zip(self.along, distances, strict=True):
+            bare = name.removeprefix("-")
+            if bare:
+                wanted[bare] = begun.values[bare] + float(-distance if name.startswith("-") else distance)
+        known = {control.name: control for control in controls}
+        off = {name: abs(value - begun.values[name]) / known[name].step for name, value in wanted.items()}
+        ends = {name: min(max(value, known[name].low), known[name].high) for name, value in wanted.items()}
+        return {name: value for name, value in ends.items() if name in moved or off[name] > 0.5}
+
+
+@dataclass(frozen=True)
+class HandlePlace:
+    """Pose of a handle, and the values of its controls that belong to it."""
+
+    pose: np.ndarray
+    """Shape (4, 4), world frame [m]."""
+    values: Mapping[str, float]
+    """In the controls' units; may lie beyond their ends, as of an object above the pad."""
+
+
+def turned_by(angles: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) by three angles [rad] about x, then y, then z of the world."""
+    about_x, about_y, about_z = rotations(np.diag(angles))
+    return about_z @ about_y @ about_x
+
+
+def turn_angles(rotation: np.ndarray) -> np.ndarray:
+    """Angles (3,) [rad] of which ``turned_by`` makes a rotation, the second within ±90°."""
+    pitch = np.arcsin(np.clip(-rotation[2, 0], -1.0, 1.0))
+    return np.array([np.arctan2(rotation[2, 1], rotation[2, 2]), pitch, np.arctan2(rotation[1, 0], rotation[0, 0])])
+
+
+@dataclass(frozen=True)
 class Solid:
     """A triangle mesh, made once; ``Snapshot.poses`` or ``reshaped`` places or deforms it."""
 
@@ -137,6 +196,12 @@ class PadView:
     """SI value of each quantity at the vertices, shape (V,)."""
     rgb: np.ndarray | None = None
     """Tactile image, shape (H, W, 3), uint8; None if the session makes none."""
+    rest_rgb: np.ndarray | None = None
+    """Tactile image of the untouched pad, (H, W, 3), uint8."""
+    height: np.ndarray | None = None
+    """z of the coat that each pixel sees, pad frame [m], (H, W)."""
+    normals: np.ndarray | None = None
+    """Unit normal of the coat that each pixel sees, pad frame, n_z < 0, (H, W, 3)."""
     markers_px: tuple[np.ndarray, np.ndarray] | None = None
     """Markers at rest and displacement, pixels of ``rgb``, (M, 2); NaN where not seen."""
     wrench: np.ndarray | None = None
@@ -160,6 +225,12 @@ class Snapshot:
     """Warning about this state; empty if there is none."""
     time_ms: Mapping[str, float] = field(default_factory=dict)
     """Wall time of what was computed [ms]."""
+    time: float | None = None
+    """Simulated time [s]; None of what is quasi-static."""
+    handle: HandlePlace | None = None
+    """Place of the session's handle; None hides it."""
+    hidden: tuple[str, ...] = ()
+    """Names of solids that are not there now."""
 
 
 @dataclass(frozen=True)
@@ -185,6 +256,8 @@ class Session(Protocol):
     solids: tuple[Solid, ...]
     lines: tuple[Lines, ...]
     pads: tuple[Pad, ...]
+    handle: Handle | None
+    """Arrows and rings that move controls; None without any."""
 
     def reset(self) -> None:
         """Back to the start; all controls let go."""
@@ -208,3 +281,15 @@ class Session(Protocol):
     def snapshot(self) -> Snapshot:
         """The state now, with images; only this computes images."""
         ...
+
+
+@dataclass(frozen=True)
+class SessionMenu:
+    """Drop-downs of the page, and the session that a choice makes."""
+
+    options: Mapping[str, tuple[str, ...]]
+    """Choices of each drop-down, by its label."""
+    chosen: Mapping[str, str]
+    """Choices that the first session shows."""
+    make: Callable[[Mapping[str, str]], Session]
+    """Session of one choice for each label; raises ``RaytacError`` for what cannot work."""

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Sequence
+from pathlib import Path
 from types import TracebackType
 
 from raytac.errors import InputError
 from raytac.view.availability import check_viewer
 from raytac.view.page import Page
 from raytac.view.player import Player
+from raytac.view.saving import Saver
 from raytac.view.server import PageAddresses
-from raytac.view.session import Session
+from raytac.view.session import Session, SessionMenu
 
 _PATIENCE = 10.0
 """Longest wait at the end for the state being computed [s]; its thread is a daemon."""
@@ -26,14 +28,25 @@ class Viewer:
             print(viewer.url)
             input("Enter ends")
 
-    Whoever can reach the port can move the sliders and sees what is shown; ``host="127.0.0.1"`` lets in this machine only. Other web pages
-    in a browser that can reach it are refused: see ``PageAddresses``.
+    Whoever can reach the port can move the sliders, save files to ``folder`` and sees what is shown; ``host="127.0.0.1"`` lets in this
+    machine only. Other web pages in a browser that can reach it are refused: see ``PageAddresses``.
     """
 
-    def __init__(self, session: Session, *, host: str = "127.0.0.1", port: int = 8080, allow_hosts: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        session: Session,
+        *,
+        menu: SessionMenu | None = None,
+        folder: str | Path | None = "runs/view",
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        allow_hosts: Sequence[str] = (),
+    ) -> None:
         """Start serving and compute the first state.
 
         Args:
+            menu: drop-downs that exchange the session; None is none.
+            folder: where the page's buttons save to, made with the first file; None leaves the buttons out.
             host: address to listen at; ``0.0.0.0`` is every network that the machine is in.
             port: in [0, 65535]; 0 lets the system choose.
             allow_hosts: names beside ``host`` that browsers may ask for, as of ``PageAddresses``.
@@ -52,9 +65,9 @@ class Viewer:
         try:
             if port not in (0, self.port):  # taken since it was checked; viser then goes on to the next
                 raise InputError("port", value=port, rule="is taken; choose another one, or 0 for any that is free")
-            page = Page(self._server, session)
-            self.player = Player(session, page.show)
-            page.attach(self.player)
+            self._page = Page(self._server, session, menu=menu, saver=None if folder is None else Saver(folder))
+            self.player = Player(session, self._page.show)
+            self._page.attach(self.player)
             self.player.start()
         except BaseException:
             self._server.stop()

@@ -16,8 +16,7 @@ pytest.importorskip("rsl_rl.algorithms", exc_type=ImportError)
 import torch
 
 from experiments import play, train_gpu
-from experiments.flat_policy import FlatPolicy
-from raytac.envs import SCRIPTED, RollBallVectorEnv
+from raytac.envs import SCRIPTED, FlatPolicy, RollBallVectorEnv
 from raytac.envs.rsl import RslVecEnv
 from raytac.errors import InputError
 from raytac.io import read_metrics

@@ -15,8 +15,7 @@ pytest.importorskip("rsl_rl.algorithms", exc_type=ImportError)
 import torch
 
 from experiments import train_gpu
-from experiments.flat_policy import FlatPolicy
-from raytac.envs import RollBallVectorEnv
+from raytac.envs import FlatPolicy, RollBallVectorEnv
 from raytac.envs.rsl import RslVecEnv, RslWarpEnv
 
 pytestmark = pytest.mark.timeout(1200)  # the first test compiles MuJoCo Warp for the CPU: minutes

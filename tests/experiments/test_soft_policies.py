@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from experiments import soft_policies
-from experiments.flat_policy import FlatPolicy
-from experiments.tensor_file import read_tensors
+from raytac.envs import FlatPolicy, read_tensors
 from raytac.errors import InputError
 from raytac.io import read_metrics
 

@@ -26,6 +26,9 @@ class PageClient:
         """Properties of each node of the 3-D scene by its name."""
         self.eye: tuple[float, ...] | None = None
         """Where the page has put this client's camera last."""
+        self.downloads: dict[str, list[bytes]] = {}
+        """Parts of the files that were sent, by name."""
+        self._transfers: dict[str, list[bytes]] = {}
         self._news = threading.Condition()
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -67,6 +70,16 @@ class PageClient:
             self.nodes.setdefault(message["name"], {}).update(message["updates"])
         elif kind in ("SetPositionMessage", "SetOrientationMessage"):
             self.nodes.setdefault(message["name"], {}).update({k: v for k, v in message.items() if k in ("position", "wxyz")})
+        elif kind == "SetSceneNodeVisibilityMessage":
+            self.nodes.setdefault(message["name"], {})["visible"] = message["visible"]
+        elif kind == "GuiRemoveMessage":
+            self.elements.pop(message["uuid"], None)
+        elif kind == "RemoveSceneNodeMessage":
+            self.nodes.pop(message["name"], None)
+        elif kind == "FileTransferStartDownload":
+            self._transfers[message["transfer_uuid"]] = self.downloads.setdefault(message["filename"], [])
+        elif kind == "FileTransferPart":
+            self._transfers[message["transfer_uuid"]].append(message["content"])
         elif kind == "SetCameraPositionMessage":
             self.eye = tuple(message["position"])
         elif kind.startswith("Gui") and "props" in message:
@@ -98,6 +111,14 @@ class PageClient:
     def _find(self, label: str) -> tuple[str, dict[str, Any]]:
         return next((uuid, e) for uuid, e in self.elements.items() if e.get("label") == label or label in e.get("options", ()))
 
+    def element(self, label: str) -> dict[str, Any]:
+        """The element of a label."""
+        return self._find(label)[1]
+
+    def labels(self) -> set[str]:
+        """Labels of all elements that are there."""
+        return {element["label"] for element in self.elements.values() if element.get("label")}
+
     def value(self, label: str) -> Any:
         return self.until(lambda: self._find(label))[1]["value"]
 
@@ -106,5 +127,12 @@ class PageClient:
         uuid, _ = self.until(lambda: self._find(label), label)
         self._send(type="GuiUpdateMessage", uuid=uuid, updates={"value": value})
 
+    def drag(self, phase: str, **pose: Any) -> None:
+        """Move the handle of the 3-D view: ``Start``, ``Update`` with ``position`` and ``wxyz``, or ``End``."""
+        kind = "TransformControlsUpdateMessage" if phase == "Update" else f"TransformControlsDrag{phase}Message"
+        self._send(type=kind, name="/handle", **pose)
+
     def press(self, button: str) -> None:
-        self.set(button, button)
+        """Press a button of a group, by its text."""
+        uuid = self.until(lambda: next(uuid for uuid, e in self.elements.items() if button in e.get("options", ())), button)
+        self._send(type="GuiUpdateMessage", uuid=uuid, updates={"value": button})

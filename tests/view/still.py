@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from raytac.errors import RaytacError
-from raytac.view.session import CameraPlace, Control, Lines, Pad, PadView, Snapshot, Solid
+from raytac.view.session import CameraPlace, Control, Handle, HandlePlace, Lines, Pad, PadView, Snapshot, Solid
 
 LENGTH = 5
 """States of its own motion."""
@@ -27,6 +27,7 @@ class StillSession:
     solids = (Solid("block", np.eye(3) * 1e-2, np.array([[0, 1, 2]]), (200, 100, 50), hides_pads=True),)
     lines = (Lines("axis", np.zeros((1, 2, 3)), (10, 20, 30)),)
     pads = (Pad("left", np.array([[0, 1, 2]]), ("indentation", "pressure")),)
+    handle: Handle | None = Handle(("reach", "", "-push"))
 
     def __init__(self, *, is_driven_at_rest: bool = True) -> None:
         self.is_driven_at_rest = is_driven_at_rest
@@ -73,5 +74,11 @@ class StillSession:
             {"indentation": np.full(3, value), "pressure": np.full(3, 1e6 * value)},
             rgb=np.full((6, 8, 3), int(10 * self.at) % 256, np.uint8),
             wrench=np.array([0.0, 0.0, -self.at, 0.0, 0.0, 1e-3 * self.at]),
+            rest_rgb=np.zeros((6, 8, 3), np.uint8),
+            height=np.full((6, 8), -value),
+            normals=np.broadcast_to([0.0, 0.0, -1.0], (6, 8, 3)),
         )
-        return Snapshot({"left": view}, controls={"reach": self.at, "push": 0.1 * self.at}, facts={"at": f"{self.at:g}"})
+        values, pose = {"reach": self.at, "push": 0.1 * self.at}, np.eye(4)
+        pose[0, 3], pose[2, 3] = value, -1e-4 * self.at
+        place = HandlePlace(pose, values)
+        return Snapshot({"left": view}, controls=values, facts={"at": f"{self.at:g}"}, handle=place)

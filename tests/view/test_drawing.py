@@ -10,7 +10,7 @@ import trimesh
 
 from raytac.gel.surface import make_grid
 from raytac.specs import load_sensor
-from raytac.view.page import ARROW_SCALE, picture
+from raytac.view.pictures import ARROW_SCALE, picture
 from raytac.view.scene_view import ColourScale, coloured_glb, legend_html, vertex_normals
 from raytac.view.sensor_view import grid_faces, sensor_lines, sensor_solids, strided
 from raytac.view.session import QUANTITIES, PadView

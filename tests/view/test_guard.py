@@ -196,6 +196,12 @@ GARBAGE = {
         size_bytes=2,
     ),
     "what only the server sends": encoded(type="GuiRemoveMessage", uuid="a"),
+    "a handle at nan": encoded(type="TransformControlsUpdateMessage", name="/handle", position=(float("nan"), 0, 0), wxyz=(1, 0, 0, 0)),
+    "a handle without a turn": encoded(type="TransformControlsUpdateMessage", name="/handle", position=(0, 0, 0), wxyz=(0, 0, 0, 0)),
+    "a handle of a long name": encoded(type="TransformControlsDragStartMessage", name="x" * 1000),
+    "a picture that is none": encoded(type="GetRenderResponseMessage", payload=b"GIF89a", render_uuid="a"),
+    "a picture that is too long": bytes(server_module.LARGEST_PICTURE + 1),
+    "a long message that is no picture": encoded(type="GuiUpdateMessage", uuid="a", updates={"value": "x" * server_module.LARGEST}),
     "a camera at nan": camera(position=(float("nan"), 0, 0)),
     "a camera without view": camera(position=(0, 0, 0)),
     "a camera without up": camera(up_direction=(0, 0, 0)),
@@ -244,7 +250,7 @@ def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 def test_garbage_ends_its_own_connection_in_one_line(viewer, witness, caplog, capfd):
     for what, message in GARBAGE.items():
-        assert Stranger(viewer).ends(message) == (1009 if what == "too long" else 1007), what
+        assert Stranger(viewer).ends(message) == (1009 if "long" in what and "name" not in what else 1007), what
     logged = lines(caplog)
     assert len(logged) == len(GARBAGE) and all(
         "hung up on 127.0.0.1 port" in line and line.isprintable() and len(line) < 250 for line in logged
@@ -282,6 +288,18 @@ def test_what_an_element_can_have_is_taken_and_one_that_is_gone_does_no_harm(vie
     assert lines(caplog) == []
 
 
+def test_a_long_picture_is_taken_and_one_that_nobody_asked_for_does_no_harm(viewer, witness, caplog):
+    stranger = Stranger(viewer)
+    stranger.link.send(camera())
+    long = b"\xff\xd8\xff" + bytes(server_module.LARGEST)
+    stranger.link.send(encoded(type="GetRenderResponseMessage", payload=long, render_uuid="nobody's"))
+    stranger.link.send(encoded(type="TransformControlsUpdateMessage", name="/other", position=(0, 0, 0), wxyz=(1, 0, 0, 0)))
+    stranger.link.send(encoded(type="GuiUpdateMessage", uuid=witness._find("reach [mm]")[0], updates={"value": 13}))
+    witness.until(lambda: "13 cannot be reached" in witness.texts(), "the connection goes on")
+    stranger.link.close()
+    assert lines(caplog) == []
+
+
 def test_a_request_that_is_no_http_says_nothing(caplog, capfd):
     with Viewer(StillSession(), port=0) as fresh:  # viser hides such faults after its first request only
         socket.create_connection(("127.0.0.1", fresh.port), timeout=10.0).close()
@@ -307,7 +325,17 @@ def test_the_messages_are_visers_own():
     assert set(server_module._Update.__struct_fields__) == {
         field.name for field in dataclasses.fields(_messages.GuiUpdateMessage)
     }
-    for raw in (camera(), encoded(type="GuiUpdateMessage", uuid="a", updates={"value": True})):
+    for name in ("TransformControlsUpdate", "TransformControlsDragStart", "TransformControlsDragEnd", "GetRenderResponse"):
+        own = next(
+            kind
+            for kind in vars(server_module).values()
+            if getattr(kind, "__struct_config__", None) and kind.__struct_config__.tag == f"{name}Message"
+        )
+        assert set(own.__struct_fields__) == {field.name for field in dataclasses.fields(getattr(_messages, f"{name}Message"))}
+    moved = encoded(
+        type="TransformControlsUpdateMessage", name="/handle", position=(1.0, 2.0, 3.0), wxyz=(1.0, 0.0, 0.0, 0.0), owner=""
+    )
+    for raw in (camera(), encoded(type="GuiUpdateMessage", uuid="a", updates={"value": True}), moved):
         again = server_module.checked_message(raw, lambda uuid: None)
         assert _messages.Message.deserialize(again) == _messages.Message.deserialize(raw)
 

@@ -5,13 +5,16 @@ from __future__ import annotations
 import socket
 import threading
 import urllib.request
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from raytac.errors import BackendError, InputError
+from raytac.errors import BackendError, InputError, RaytacError
 from raytac.view import availability
-from raytac.view.session import reaching
+from raytac.view.recording import read_recording
+from raytac.view.session import Control, Pad, SessionMenu, Snapshot, reaching
 from raytac.view.viewer import Viewer
 from tests.view.page_client import PageClient
 from tests.view.still import LENGTH, StillSession
@@ -21,8 +24,8 @@ from tests.view.still import LENGTH, StillSession
 def open_page():
     opened: list[Any] = []
 
-    def make(session: StillSession) -> tuple[Viewer, PageClient]:
-        viewer = Viewer(session, port=0)
+    def make(session: StillSession, **options: Any) -> tuple[Viewer, PageClient]:
+        viewer = Viewer(session, port=0, **options)
         opened.append(viewer)
         client = PageClient(viewer.port)
         opened.append(client)
@@ -126,6 +129,98 @@ def test_each_client_looks_where_it_likes(open_page):
     one.press("all")
     one.until(lambda: one.eye == pytest.approx((2.0, -3.0, 2.0)), "the start again")
     two.close()
+
+
+def test_the_handle_moves_what_the_sliders_move_and_stops_at_their_ends(open_page):
+    session = StillSession()
+    _, client = open_page(session)
+    still = (1.0, 0.0, 0.0, 0.0)
+    node = client.until(lambda: client.nodes.get("/handle"))
+    client.drag("Start")
+    client.drag("Update", position=(0.35, 0.0, 0.0), wxyz=still)  # 3.5 mm, at 100 units a metre
+    client.until(lambda: at(client, 3.5) and client.value("reach [mm]") == 3.5, "the slider follows the handle")
+    assert all("push" not in call for call in session.calls if isinstance(call, dict))  # what did not move is not asked for
+    client.drag("Update", position=(0.35, 0.0, -4.0), wxyz=still)  # 40 mm down, 30 beyond the end
+    client.until(lambda: client.value("push [N]") == 10.0 and at(client, 10.0), "the end")
+    client.drag("End")
+    client.until(lambda: node.get("position") == pytest.approx((1.0, 0.0, -0.1)), "the handle where the object is")
+    client.set("reach [mm]", 4.0)
+    client.until(lambda: node.get("position") == pytest.approx((0.4, 0.0, -0.04)), "the handle follows the slider")
+    client.set("handle", False)
+    client.until(lambda: node.get("visible") is False or not node.get("visible", True), "no handle")
+
+
+def test_one_looks_back_on_the_timeline_and_goes_on_from_the_present(open_page):
+    session = StillSession()
+    _, client = open_page(session)
+    client.press("Play")
+    client.until(lambda: at(client, LENGTH) and "paused" in client.texts(), "the end")
+    assert client.value("timeline") == LENGTH
+    client.set("timeline", 2.0)
+    client.until(lambda: at(client, 2.0) and "state 3 of 6" in client.texts(), "the past")
+    assert client.value("reach [mm]") == 2.0 and session.at == LENGTH
+    client.set("colour", "normal traction [kPa]")
+    client.until(lambda: "<div>normal traction [kPa]</div>" in client.texts() and at(client, 2.0), "the past in other colours")
+    client.set("reach [mm]", 4.5)
+    client.until(lambda: at(client, 4.5) and "looking back" not in client.texts(), "the present")
+    plot = next(e for e in client.elements.values() if e.get("title") == "left: force [N]")
+    assert plot["visible"] and len(client.until(lambda: plot["data"])) == 4
+    client.press("Reset")
+    client.until(lambda: at(client, 0.0) and not client.element("timeline")["visible"], "a timeline of its own")
+
+
+class Other(StillSession):
+    title = "other · nothing"
+    controls = (Control("lift", "lift [mm]", 0.0, 5.0, 0.5),)
+    handle = None
+    pads = (Pad("right", np.array([[0, 1, 2]])),)
+
+    def snapshot(self) -> Snapshot:
+        shown = super().snapshot()
+        return replace(shown, pads={"right": shown.pads["left"]}, controls={"lift": self.at}, handle=None)
+
+
+def test_another_session_is_chosen_in_the_page_and_what_cannot_work_changes_nothing(open_page):
+    def made(choice):
+        if choice["object"] == "bad":
+            raise RaytacError("bad: it has no object")
+        return {"still": StillSession, "other": Other}[choice["object"]]()
+
+    options = {"object": ("still", "other", "bad"), "sensor": ("mini", "dome")}
+    menu = SessionMenu(options, {"object": "still", "sensor": "mini"}, made)
+    viewer, client = open_page(StillSession(), menu=menu)
+    client.press("Step")
+    client.until(lambda: at(client, 1.0))
+    client.set("object", "bad")
+    client.until(lambda: "it has no object" in client.texts(), "the error")
+    client.until(lambda: client.value("object") == "still" and at(client, 1.0), "the present state")
+    client.press("Step")
+    client.until(lambda: at(client, 2.0) and "it has no object" not in client.texts(), "it goes on")
+    client.set("object", "other")
+    client.until(lambda: "other · nothing" in client.texts() and at(client, 0.0), "the other session")
+    client.set("lift [mm]", 2.0)
+    client.until(lambda: at(client, 2.0), "its own slider")
+    live = client.labels()
+    assert "reach [mm]" not in live and "left" not in live and "right" in live and "/handle" not in client.nodes
+    late = PageClient(viewer.port)
+    late.until(lambda: "other · nothing" in late.texts() and at(late, 2.0), "who comes later")
+    assert "reach [mm]" not in late.labels() and late.value("object") == "other" and late.value("sensor") == "mini"
+    late.close()
+
+
+def test_what_is_saved_is_a_file_and_a_download(open_page, tmp_path):
+    _, client = open_page(StillSession(), folder=tmp_path / "runs")
+    client.set("save 3-D view", False)  # this client has no browser to draw it
+    client.press("Step")
+    client.until(lambda: at(client, 1.0))
+    for kind, suffix in (("PNG", ".png"), ("GIF", ".gif"), ("Recording", ".npz")):
+        client.press(kind)
+        name = client.until(lambda: next((n for n in client.downloads if n.endswith(suffix)), None), kind)  # noqa: B023
+        client.until(lambda: name in client.texts(), "the file's name")  # noqa: B023
+        assert (tmp_path / "runs" / name).read_bytes() == b"".join(client.downloads[name])
+    assert len(read_recording(next((tmp_path / "runs").glob("*.npz")))._states) == 2
+    _, other = open_page(StillSession(), folder=None)
+    assert "save 3-D view" not in other.labels()
 
 
 def test_closing_tells_the_clients_frees_the_port_and_ends_all_threads():

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
 from raytac.errors import InputError, RaytacError
 from raytac.robots import ik
+from raytac.robots.mount import mount
 from raytac.specs import BodySpec, RobotSpec, TaskScene, load_task
 from raytac.view.world_session import WorldSession
 from raytac.world.world import TactileWorld
 
+GRIPPER_MODEL = Path(__file__).parents[2] / "examples" / "gripper.xml"
 BALL = BodySpec("ball", "sphere", {"radius": 0.005}, position=(0.0, 0.0, 0.0051), mass=0.05, colour=(0.5, 0.0, 0.0))
 UP = TaskScene("upward", RobotSpec("fixed_sensor"), (BALL,))
 """A sensor on its back under a ball; world and pad frame are one."""
@@ -95,17 +99,51 @@ def test_an_arm_presses_the_ball_and_the_sensor_feels_it():
     assert touched[:2] == pytest.approx(ball[:2], abs=1e-3)
 
 
-def test_without_mink_the_arm_stands_still_and_the_page_says_why(monkeypatch):
+def test_without_mink_the_joints_are_steered_alone_and_the_page_says_why(monkeypatch):
     def missing():
         raise ik.BackendError("mink is not installed")
 
     monkeypatch.setattr(ik, "_mink", missing)
     view = session("ball_rolling")
-    assert view.controls == ()
+    assert [control.label for control in view.controls] == [f"joint{k} [°]" for k in range(1, 8)] and view.handle is None
     start = view.snapshot().pads["sensor"].world_from_pad
     shot = after(view, 20)
     assert "mink is not installed" in shot.warning
     assert shot.pads["sensor"].world_from_pad[:3, 3] == pytest.approx(start[:3, 3], abs=1e-4)
+    view.reset()
+    first = view.snapshot().controls["joint joint7"]
+    shot = after(view, 60, **{"joint joint7": first + 20.0})
+    turned = shot.pads["sensor"].world_from_pad[:3, :3] @ start[:3, :3].T
+    assert np.degrees(np.arccos((np.trace(turned) - 1.0) / 2.0)) == pytest.approx(20.0, abs=0.5)
+
+
+def test_joints_and_pose_take_over_from_each_other():
+    view = session("ball_rolling", steps=2)
+    first = view.snapshot().controls
+    shot = after(view, 20, **{"joint joint1": first["joint joint1"] + 5.0})
+    assert shot.controls["joint joint1"] == pytest.approx(first["joint joint1"] + 5.0)
+    assert shot.controls["yaw"] == pytest.approx(5.0, abs=0.3) and abs(shot.controls["y"]) > 5.0  # the pose follows
+    at = shot.pads["sensor"].world_from_pad[:3, 3]
+    shot = after(view, 20, z=shot.controls["z"] + 10.0)
+    assert shot.pads["sensor"].world_from_pad[:3, 3] - at == pytest.approx([0.0, 0.0, 0.01], abs=1.5e-3)
+    assert abs(shot.controls["joint joint4"] - first["joint joint4"]) > 0.5  # and the joints follow the pose
+
+
+def test_every_actuator_of_a_model_of_ones_own_has_a_slider_with_its_range():
+    spec = mujoco.MjSpec.from_file(str(GRIPPER_MODEL))
+    spec.actuator("lift").ctrllimited, spec.actuator("lift").ctrlrange = True, (-0.02, 0.08)
+    mount(spec, "gelsight_mini_9x11", site="left_tip", name="left")
+    mount(spec, "gelsight_mini", site="right_tip", name="right")
+    world = TactileWorld(spec, touches=["cube"], control_timestep=0.02, outputs=("wrench",), pitch=0.4e-3)
+    view = WorldSession(world)
+    lift, left, right = view.controls
+    assert (lift.label, lift.low, lift.high) == ("lift [mm]", pytest.approx(-20.0), pytest.approx(80.0))
+    assert (left.label, right.label) == ("left [mm]", "right [mm]") and "no range" in left.hint and "no range" not in lift.hint
+    shot = after(view, 20, **{"actuator left": -12.0, "actuator right": -12.0})
+    wrench = shot.pads["left"].wrench
+    assert wrench is not None and wrench[2] < -1.0 and shot.controls["actuator left"] == -12.0
+    shot = after(view, 40, **{"actuator lift": 30.0})
+    assert shot.poses[next(s.name for s in view.solids if s.name.startswith("cube/"))][2, 3] > 0.035  # carried
 
 
 def test_everything_that_is_seen_is_drawn_once_and_the_gel_as_a_coat():
