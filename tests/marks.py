@@ -101,6 +101,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "test_threads.py",
         "test_warp_runtime.py",
         "view/test_drawing.py",
+        "view/test_played.py",
         "view/test_press_session.py",
         "view/test_world_session.py",
         "world",
