@@ -43,12 +43,12 @@ SKIPPED = {
     r"raytac view\b": "serves until it is interrupted",
     r"raytac compare\b.*--device cuda": "needs a GPU",
     r"raytac compare\b.*--(markers|level|full)": "takes longer than a first run, and says so",
-    r"raytac compare\b.*--quick": "is contained in the comparison before it",
+    r"raytac compare\b.*--(modes|quick)": "is contained in the comparison before it",
 }
 """Commands that do not run, as regular expressions, and reasons."""
 INSTALLS = r"python3 -m venv|pip install"
 """Commands after whose failure nothing else can run."""
-OWN_PRESS = r"raytac press part\."
+OWN_PRESS, COMPARE = r"raytac press part\.", r"raytac compare(\s|$)"
 BLOCK = re.compile(r"(?:<!-- needs: ([\w ]+) -->\n)?^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LAST_LINES = 12
 
@@ -207,7 +207,7 @@ def figures(outcomes: Sequence[Outcome]) -> dict[str, Metric]:
     own = next((k for k, outcome in enumerate(outcomes) if re.match(OWN_PRESS, outcome.command)), None)
     if own is not None and not any(outcome.status for outcome in outcomes[: own + 1]):
         result["newcomer.minutes_to_first_own_press"] = sum(outcome.seconds for outcome in outcomes[: own + 1]) / 60
-    compared = [outcome for outcome in outcomes if outcome.command.startswith("raytac compare ")]
+    compared = [outcome for outcome in outcomes if re.match(COMPARE, outcome.command)]
     if compared and not any(outcome.status for outcome in compared):
         result["newcomer.compare_minutes"] = sum(outcome.seconds for outcome in compared) / 60
     return result
@@ -234,7 +234,7 @@ def main(args: Args) -> None:
         try:
             home, checkout = place / "home", place / "raytac"
             home.mkdir()
-            clone = Step("", f"git clone --quiet {shlex.quote(str(ROOT))} raytac")
+            clone = Step("(checkout)", f"git clone --quiet {shlex.quote(str(ROOT))} raytac")
             printed = []
             for outcome, text in follow([clone], place, home, 60 * args.limit_min):
                 outcomes.append(outcome)
