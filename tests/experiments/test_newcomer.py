@@ -51,7 +51,7 @@ print(a)
 
 
 def test_commands_come_from_the_blocks_of_a_page_in_order_and_once() -> None:
-    steps = steps_of([("docs/own-page.md", PAGE), ("b.md", "```sh\nraytac view sphere\nraytac doctor\n```\n")])
+    steps = steps_of([("guide/own-page.md", PAGE), ("b.md", "```sh\nraytac view sphere\nraytac doctor\n```\n")])
     assert [" ".join(step.command.split()) for step in steps] == [
         "python3 -m venv .venv && . .venv/bin/activate",
         "pip install -e '.[a,b]'",
