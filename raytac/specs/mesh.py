@@ -112,7 +112,7 @@ def closed_mesh(
     extent = float(np.ptp(mesh.vertices, axis=0).max()) * scale
     if not SIZE_RANGE[0] <= extent <= SIZE_RANGE[1]:
         low, high = (1e3 * s for s in SIZE_RANGE)
-        rule = f"the object is {extent * 1e3:.4g} mm long, must be {low:g} to {high:g} mm: scale is metres per file unit"
+        rule = f"the object is {extent * 1e3:.6g} mm long, must be {low:g} to {high:g} mm: scale is metres per file unit"
         # The other unit that files have.
         other = {0.001: 1.0, 1.0: 0.001}.get(scale)
         if other is not None and SIZE_RANGE[0] <= extent * other / scale <= SIZE_RANGE[1]:

@@ -112,8 +112,8 @@ def press_of(
     if depth is not None and force is not None:
         raise InputError("depth, force", value=(depth, force), rule="cannot both be given: a press ends at one of them")
     if depth is None and force is None and (is_mesh or is_map):
-        rule = "must be given with a mesh or a height map, in metres (on the command line in millimetres), or force in newtons"
-        raise InputError("depth", rule=rule)
+        how = "raytac press FILE --depth 0.8 (mm) or --force 2 (N), in Python depth=0.8e-3 (m) or force=2.0 (N)"
+        raise InputError("depth", rule=f"must be given with a mesh or a height map, or force: {how}")
     if is_mesh:
         scene = _mesh_scene(source, scale, repair=bool(repair))
     elif isinstance(source, np.ndarray):
