@@ -24,7 +24,11 @@ class Taxim(OpticsConfig[Any]):
 
     The sensor's lights matter only then. The table's image is laid over the whole image."""
     shadows: bool | None = None
-    """Cast shadows; None is as the sensor says, where the table has them."""
+    """Cast shadows from the table's list.
+
+    None: those of a calibration folder as the sensor says; a baked table casts none, since they bring it no nearer to
+    the ray tracer (docs/measurements/image-modes.md).
+    """
 
     def __post_init__(self) -> None:
         check_shadows(self.shadows)

@@ -119,8 +119,9 @@ class TaximMode(ImageMode):
     def _set_up(self) -> None:
         super()._set_up()
         sensor, calibration, shadows = self.sensor, self.config.calibration, self.config.shadows
-        casts = casts_shadows(sensor, shadows)
-        # Without being asked, a table without shadows casts none; one that is asked to is baked with them, whatever the sensor says.
+        # Unless asked for, shadows are only those of a calibration folder: those of a baked table are ragged under strips of light. A table
+        # that is asked to is baked with them, whatever the sensor says.
+        casts = bool(shadows) if calibration is None else casts_shadows(sensor, shadows)
         baked_of = replace(sensor, optics=replace(sensor.optics, shadows=sensor.optics.shadows or casts))
         self.table, self._is_own = _table(calibration, baked_of, self.device), calibration is None
         self.shadows = casts and (shadows is not None or self.table.shadow is not None)
