@@ -39,7 +39,8 @@ def blocks(text: str) -> list[str]:
 
 
 def run(code: str, folder: Path) -> None:
-    """Run a program in ``folder``, with this checkout's packages, on the CPU."""
+    """Run a program in ``folder``, with this checkout's packages, on the CPU; pages name files as a checkout has them."""
+    (folder / "examples").symlink_to(ROOT / "examples")
     (folder / "page.py").write_text(code, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path]), "MPLBACKEND": "Agg"}
     result = subprocess.run([sys.executable, "page.py"], cwd=folder, env=environment, capture_output=True, text=True, check=False)
