@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 from raytac.device import cuda_device_count
 from raytac.installation import foreign_ipc
@@ -27,6 +28,15 @@ def quiet_warp() -> None:
     use_writable_cache()
     with _no_standard_error() if cuda_device_count() == 0 else contextlib.nullcontext():
         wp.init()
+
+
+def has_compiled_kernels() -> bool:
+    """True if Warp's cache holds kernels of raytac, of this version or another; call it after ``quiet_warp``."""
+    if foreign_ipc() is not None:
+        return True
+    import warp as wp
+
+    return any(Path(wp.config.kernel_cache_dir).glob("wp_raytac*"))
 
 
 @contextlib.contextmanager

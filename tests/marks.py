@@ -100,6 +100,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "test_sensor_soft.py",
         "test_threads.py",
         "test_warp_runtime.py",
+        "test_warp_messages.py",
         "view/test_drawing.py",
         "view/test_played.py",
         "view/test_press_session.py",

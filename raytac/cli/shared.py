@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,7 @@ from raytac.physics.base import PhysicsConfig
 from raytac.physics.registry import PHYSICS, scene_physics
 from raytac.specs import PressScene, SensorSpec, TaskScene, load_sensor, with_lights
 from raytac.specs.sensor import AUTO
-from raytac.warp_messages import quiet_warp
+from raytac.warp_messages import has_compiled_kernels, quiet_warp
 
 FROM_SCRATCH = "12,8,9"
 """Numbers of LEDs of the Mini's main figures in docs/measurements/photographs.md.
@@ -196,6 +197,8 @@ class SolverOptions(CommonOptions):
         """Call before contacts are first computed."""
         if not self.verbose:
             quiet_warp()
+            if not has_compiled_kernels():
+                logging.getLogger("raytac").info("compiling kernels: up to a minute, once on a machine")
 
 
 @dataclass(frozen=True, kw_only=True)

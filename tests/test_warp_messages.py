@@ -1,0 +1,27 @@
+"""What the command says before kernels are compiled."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+from raytac.cli.shared import SolverOptions
+from raytac.warp_messages import has_compiled_kernels
+
+
+def test_the_command_says_once_that_kernels_are_compiled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    SolverOptions().prepare_warp()
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    caplog.clear()
+    with caplog.at_level(logging.INFO, logger="raytac"):
+        assert not has_compiled_kernels()
+        SolverOptions().prepare_warp()
+        assert [record.getMessage() for record in caplog.records] == ["compiling kernels: up to a minute, once on a machine"]
+        (tmp_path / "wp_raytac.gel_0123456").mkdir()
+        SolverOptions().prepare_warp()
+    assert has_compiled_kernels() and len(caplog.records) == 1
