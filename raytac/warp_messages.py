@@ -31,12 +31,12 @@ def quiet_warp() -> None:
 
 
 def has_compiled_kernels() -> bool:
-    """True if Warp's cache holds kernels of raytac, of this version or another; call it after ``quiet_warp``."""
+    """True if Warp's cache holds kernels of raytac, of any version; for use after ``quiet_warp``."""
     if foreign_ipc() is not None:
         return True
     import warp as wp
 
-    return any(Path(wp.config.kernel_cache_dir).glob("wp_raytac*"))
+    return any(Path(wp.config.kernel_cache_dir or "").glob("wp_raytac*"))
 
 
 @contextlib.contextmanager
