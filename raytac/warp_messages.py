@@ -31,7 +31,7 @@ def quiet_warp() -> None:
 
 
 def has_compiled_kernels() -> bool:
-    """True if Warp's cache holds kernels of raytac, of any version; for use after ``quiet_warp``."""
+    """True if Warp's cache holds kernels of raytac, of any version; after ``quiet_warp``."""
     if foreign_ipc() is not None:
         return True
     import warp as wp
