@@ -63,7 +63,7 @@ def test_a_table_without_shadows_casts_none_unless_asked() -> None:
 
 
 def test_a_table_is_baked_with_shadows_where_sensor_or_option_wants_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever leaves out the shadows of a sensor that casts them takes the same table, which another mode may have baked already."""
+    """A baked table casts only what is asked for; of a sensor that casts shadows it is the same table for all modes."""
     baked: list[bool] = []
 
     def fake(sensor: SensorSpec, **_: Any) -> Any:
@@ -71,10 +71,13 @@ def test_a_table_is_baked_with_shadows_where_sensor_or_option_wants_them(monkeyp
         return make_table(sensor, shadow=sensor.optics.shadows)
 
     monkeypatch.setattr(bake, "baked_table", fake)
-    cases = ((LIT, None, True), (LIT, False, False), (DARK, None, False), (DARK, True, True))
+    cases = ((LIT, None, False), (LIT, False, False), (LIT, True, True), (DARK, None, False), (DARK, True, True))
     for sensor, asked, casts in cases:
         assert Taxim(shadows=asked).build(sensor, resolution=RESOLUTION, device="cpu").shadows is casts
-    assert baked == [True, True, False, True]
+    assert baked == [True, True, True, False, True]
+    for sensor, casts in ((LIT, True), (DARK, False)):
+        table = make_table(sensor, shadow=True)
+        assert Taxim(table).build(sensor, resolution=RESOLUTION, device="cpu").shadows is casts
 
 
 def test_a_sensor_without_shadows_is_baked_without_them() -> None:

@@ -119,7 +119,7 @@ def test_missing_and_unknown_format(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("scale", "rule"),
     [
-        (1.0, "the object is 1e+04 mm long, must be 0.1 to 500 mm"),
+        (1.0, "the object is 10000 mm long, must be 0.1 to 500 mm"),
         (1e-6, "the object is 0.01 mm long, must be 0.1 to 500 mm"),
         (0.0, "must be a finite number of metres per file unit > 0"),
         (float("nan"), "must be a finite number of metres per file unit > 0"),
