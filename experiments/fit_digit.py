@@ -154,11 +154,6 @@ def main(args: Args) -> None:
         metrics |= {"photographs": len(whole), "fitted": len(fitted.presses), "held_out": len(unseen.presses), "leds": args.leds}
         metrics |= {"rounds": args.rounds, "shadows": int(args.shadows), "ball_diameter_mm": args.ball_diameter_mm}
         with Progress(desc="fit", unit="step") as bar:
-
-            def tick(stage: str, cost: float) -> None:
-                bar.update()
-                bar.set_postfix_str(f"{stage}, cost {cost:.4g}")
-
             models = fit_models(
                 sensor,
                 fitted,
@@ -170,7 +165,7 @@ def main(args: Args) -> None:
                 rounds=args.rounds,
                 prior="tied" if args.leds > 1 else "free",
                 tracing=tracing,
-                tick=tick,
+                tick=bar.fit_step,
             )
         images = scored(models, unseen, metrics)
         file = models.modes[ALONE].sensor  # type: ignore[attr-defined]

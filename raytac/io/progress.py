@@ -34,6 +34,11 @@ class Progress(tqdm):
             options |= {"display": False} if _IN_NOTEBOOK else {}
         super().__init__(iterable, desc, file=stream, disable=not show or stream is None, **options)
 
+    def fit_step(self, stage: str, cost: float) -> None:
+        """Count a step of a fit, and show its stage and cost."""
+        self.update()
+        self.set_postfix_str(f"{stage}, cost {cost:.4g}")
+
     def refresh(self, *args: Any, **keywords: Any) -> None:
         """Redraw the bar, or write a line if the last one is ``interval`` old."""
         if not self._as_lines:

@@ -96,11 +96,6 @@ def run_calibrate_optics(
     train, test = shots.take(index[~is_test]), shots.take(index[is_test])
     with result_folder(out, FILES) as folder:  # before the fit, so that a folder that cannot be written is refused at once
         with Progress(desc=f"calibrate {model}", unit="step") as bar:
-
-            def tick(stage: str, cost: float) -> None:
-                bar.update()
-                bar.set_postfix_str(f"{stage}, cost {cost:.4g}")
-
             models = fit_models(
                 sensor,
                 train,
@@ -114,7 +109,7 @@ def run_calibrate_optics(
                 shadow_table=shadow_table,
                 drift=drift,
                 tracing=RayTraced(shadows=shadows),
-                tick=tick,
+                tick=bar.fit_step,
             )
         mode, fitted = models.modes[model], models.fitted
         metrics: dict[str, Metric] = {
