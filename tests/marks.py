@@ -65,6 +65,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "observe/test_ros.py",
         "gel/test_elastic_surround.py",
         "gel/test_pyramid.py",
+        "physics/rigid/test_load_law.py",
         "physics/rigid/test_pad_search.py",
         "physics/rigid/test_pierced.py",
         "physics/rigid/test_step_kernels.py",

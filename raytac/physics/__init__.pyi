@@ -11,6 +11,7 @@ from .press import PressPad as PressPad
 from .registry import PHYSICS as PHYSICS
 from .registry import register as register
 from .rigid.contacts import PadContacts as PadContacts
+from .rigid.load_law import LoadLaw as LoadLaw
 from .rigid.load_law import first_touch as first_touch
 from .rigid.pad import RigidPad as RigidPad
 from .rigid.search import PadSearch as PadSearch

@@ -39,7 +39,7 @@ class PadContacts:
     force: np.ndarray
     """Normal force [N], (n, M), without the hard back, at depths deepest · (k / (M − 1))²."""
     radius: np.ndarray
-    """Contact radius at the same depths [m], (n, M)."""
+    """Radius of the disc that is as stiff at the same depths [m], (n, M)."""
 
     def __len__(self) -> int:
         return len(self.env)

@@ -200,7 +200,6 @@ def kinds_of(shapes: Shapes, placed: Placed, block: wp.int32) -> wp.vec2i:
 def add_outline(
     shapes: Shapes, pads: Pads, placed: Placed, block: wp.int32, lane: wp.int32, pad: wp.int32, level: wp.int32, window: wp.vec4i,
     gap: wp.array(dtype=wp.float64), ends: wp.array(dtype=wp.vec2f), below: wp.float64, depth: wp.float64, inverse: wp.float64,
-    flat: wp.float64,
     # outputs
     sums: wp.array(dtype=Sums),
 ):  # fmt: skip
@@ -292,6 +291,6 @@ def add_outline(
                     for m in range(4):
                         if corners[m] < below:
                             x, y = i0 + i + wp.where(m == 1 or m == 2, 1, 0), j0 + j + m / 2
-                            add_node(sums, larger(corners[m] + depth, _0) * inverse, x, y, flat, more)
+                            add_node(sums, larger(corners[m] + depth, _0) * inverse, x, y, more, 0)
             i += across()
         j += wp.block_dim() // across()

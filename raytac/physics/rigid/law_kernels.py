@@ -1,9 +1,7 @@
 """Load law of a contact from its nodes' gaps: ``LoadLaw`` at a few depths, in Warp.
 
 Nodes are sorted into bins by their gap. All that is added up is whole numbers of less than 2^53, so that the sums do not depend on the
-order. Of the nodes of a bin it is not known which has which gap: a bin's mean counts.
-
-Constants of a gel's law: 2 E*, radius of the widest contact, then stiffening, moment and bend of each entry of its ``LayerResponse``.
+order. Of the nodes of a bin it is not known which has which gap: a bin's mean counts. Regions and their lines are those of ``regions``.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -16,28 +14,30 @@ from __future__ import annotations
 import warp as wp
 
 from raytac.physics.rigid.contacts import LAW_POINTS
-from raytac.physics.rigid.layer_response import ENTRIES
 from raytac.physics.rigid.load_law import SMOOTH
+from raytac.physics.rigid.punch_kernels import entry_of, flat_punch, punch_radius, radius_of, response_at
+from raytac.physics.rigid.regions import CROSSING, PER_CORNER, PER_SIDE
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
-BINS = 4 * (LAW_POINTS - 1)
+BINS = 2 * (LAW_POINTS - 1)
 """Bins of gaps: regions below so many levels are tried for the contact."""
-Sums = wp.types.vector(length=5, dtype=wp.float64)
-"""Of a bin: nodes in parts; sums of their x, y numbers, squared distances and gaps.
+Sums = wp.types.vector(length=8, dtype=wp.float64)
+"""Of a bin: nodes in parts; sums of their numbers x, y, of xx, xy, yy, gaps and crossings.
 
-Distances are from the pad's first node."""
+Numbers are from the pad's first node. ``crossings_at`` says what crossings are."""
 _BINS = wp.constant(wp.int32(BINS))
 _SCALE = wp.constant(wp.float64(BINS))
 _POINTS = wp.constant(wp.int32(LAW_POINTS))
-_ENTRIES = wp.constant(wp.float64(ENTRIES - 1))
-_LAST_ENTRY = wp.constant(wp.int32(ENTRIES - 2))
-_FIRST_ENTRY, _ENTRY = wp.constant(wp.int32(2)), wp.constant(wp.int32(3))
-"""Of the response in a gel's constants: its place and the numbers of one entry."""
+PUNCH_BINS = 7
+"""Bins from one region of which the stiffness is computed to the next.
+
+In between it follows the root of the area."""
+_PUNCH = wp.constant(wp.int32(PUNCH_BINS))
+_PER_SIDE, _PER_CORNER = wp.constant(wp.int32(PER_SIDE)), wp.constant(wp.int32(PER_CORNER))
+_CROSSING = wp.constant(wp.float64(CROSSING))
 _GAP_UNIT = wp.constant(wp.float64(2.0**27))
 """Of a bin's sum of gaps, over the greatest gap: 6·10^4 nodes fit into a sum."""
-_SQUARE_UNIT = wp.constant(wp.float64(2.0**9))
-"""Of a bin's sum of squares, over the spacing's square."""
 _SMOOTH = wp.constant(wp.float64(SMOOTH))
 _LEAST_STEP = wp.constant(wp.float64(1e-12))
 _NODE = wp.constant(wp.float64(1024.0))
@@ -49,6 +49,9 @@ _6 = wp.constant(wp.float64(6.0))
 _12 = wp.constant(wp.float64(12.0))
 _0 = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
+_QUARTER = wp.constant(wp.float64(0.25))
+_TWELFTH = wp.constant(wp.float64(1.0 / 12.0))
+_LEAST_VARIANCE = wp.constant(wp.float64(1e-30))
 _STEPS = wp.constant(wp.float64(LAW_POINTS - 1.0))
 DEEPER = wp.constant(wp.float64(((LAW_POINTS - 1.0) / 22.0) ** 2))
 """Least depth up to which a law is tabulated, over the present one: some 2.
@@ -60,7 +63,6 @@ _FEWEST = wp.constant(wp.float64(6.0))
 """Steps of the table up to the present depth at least, for which it is stretched."""
 _SHALLOWEST = wp.constant(wp.float64(10e-6))
 """Least depth up to which a law is tabulated [m]."""
-_PI = wp.constant(wp.float64(3.141592653589793))
 
 
 @wp.struct
@@ -111,36 +113,99 @@ def clear_bins(bins: Bins, block: wp.int32, lane: wp.int32, lanes: wp.int32):
 
 @wp.func
 def add_node(
-    sums: wp.array(dtype=Sums), share: wp.float64, i: wp.int32, j: wp.int32, flat: wp.float64, weight: wp.float64
+    sums: wp.array(dtype=Sums), share: wp.float64, i: wp.int32, j: wp.int32, weight: wp.float64, crossings: wp.int32
 ):  # fmt: skip
     """Add node ``i``, ``j`` of a pad to the bins of a block, in any order.
 
-    ``share``: its gap at touch over the farthest that counts, in [0, 1). ``flat``: spacing along y over that along x. ``weight``: cells
-    for which the node stands; what is added to one node may be negative, and not their sum.
+    ``share``: its gap at touch over the farthest that counts, in [0, 1). ``weight``: cells for which the node stands; what is added to
+    one node may be negative, and not their sum. ``crossings``: of ``crossings_at`` it, once.
     """
     k = wp.min(wp.int32(wp.sqrt(share) * _SCALE), _BINS - 1)
     parts = wp.floor(_NODE * weight + _HALF)
     x, y = wp.float64(i), wp.float64(j)
-    square = wp.floor((x * x + y * y * flat * flat) * _SQUARE_UNIT + _HALF)
-    wp.atomic_add(sums, k, parts * Sums(_1, x, y, square, wp.floor(share * _GAP_UNIT)))
+    px, py = parts * x, parts * y
+    wp.atomic_add(
+        sums, k, Sums(parts, px, py, px * x, px * y, py * y, parts * wp.floor(share * _GAP_UNIT), wp.float64(crossings))
+    )
 
 
 @wp.func
-def radius_of(nodes: wp.float64, cell: wp.float64) -> wp.float64:
-    """Radius [m] of a disc with the area of so many nodes, each of ``cell`` [m²]."""
-    return wp.sqrt(nodes * cell / _PI)
+def crossings_at(gap: wp.array(dtype=wp.float64), i: wp.int32, j: wp.int32, nx: wp.int32, ny: wp.int32) -> wp.int32:
+    """By how much node ``i``, ``j`` of ny rows of nx adds to its region's perimeter.
+
+    That is the weights of neighbours with a larger gap less those with a smaller one. There is no gap beyond the window.
+    """
+    k = j * nx + i
+    here = gap[k] + _0
+    if i > 0 and j > 0 and i < nx - 1 and j < ny - 1:
+        side = rises(gap[k - 1], here) + rises(gap[k + 1], here) + rises(gap[k - nx], here) + rises(gap[k + nx], here)
+        corner = rises(gap[k - nx - 1], here) + rises(gap[k - nx + 1], here)
+        corner += rises(gap[k + nx - 1], here) + rises(gap[k + nx + 1], here)
+        return _PER_SIDE * side + _PER_CORNER * corner
+    result = wp.int32(0)
+    m = wp.int32(0)
+    while m < 9:
+        p, q = m % 3 - 1, m / 3 - 1
+        rise = wp.int32(1)
+        if i + p >= 0 and i + p < nx and j + q >= 0 and j + q < ny:
+            rise = rises(gap[k + q * nx + p], here)
+        if m != 4:
+            result += rise * wp.where(m % 2 == 1, _PER_SIDE, _PER_CORNER)
+        m += 1
+    return result
 
 
 @wp.func
-def response_at(radius: wp.float64, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.vec3d:
-    """Stiffening, moment and bend of ``LayerResponse`` for a contact of a radius [m]."""
-    at = wp.min(wp.sqrt(radius / law[pad, 1]), _1) * _ENTRIES
-    k = wp.min(wp.int32(at), _LAST_ENTRY)
-    t = at - wp.float64(k)
-    n = _FIRST_ENTRY + _ENTRY * k
-    before = wp.vec3d(law[pad, n], law[pad, n + 1], law[pad, n + 2])
-    n += _ENTRY
-    return before + t * (wp.vec3d(law[pad, n], law[pad, n + 1], law[pad, n + 2]) - before)
+def rises(other: wp.float64, here: wp.float64) -> wp.int32:
+    """1, 0 or −1 where the other gap is larger, the same or smaller."""
+    return wp.int32(other > here) - wp.int32(other < here)
+
+
+@wp.struct
+class Area:
+    """Sums over the nodes of a region, lengths in spacings of nodes along x."""
+
+    nodes: wp.float64
+    x: wp.float64
+    y: wp.float64
+    xx: wp.float64
+    xy: wp.float64
+    yy: wp.float64
+    crossings: wp.float64
+
+
+@wp.func
+def widened(area: Area, sums: Sums, flat: wp.float64) -> Area:
+    """A region and one more bin; ``flat``: spacing along y over that along x."""
+    result = Area()
+    result.nodes = area.nodes + sums[0] / _NODE
+    result.x = area.x + sums[1] / _NODE
+    result.y = area.y + sums[2] / _NODE * flat
+    result.xx = area.xx + sums[3] / _NODE
+    result.xy = area.xy + sums[4] / _NODE * flat
+    result.yy = area.yy + sums[5] / _NODE * flat * flat
+    result.crossings = area.crossings + sums[7]
+    return result
+
+
+@wp.func
+def moments_of(area: Area, each: wp.float64, flat: wp.float64) -> wp.vec3d:
+    """Second moments xx, xy, yy about the centroid, of cells; ``each``: one over their number."""
+    cx, cy = area.x * each, area.y * each
+    return wp.vec3d(
+        area.xx * each - cx * cx + _TWELFTH, area.xy * each - cx * cy, area.yy * each - cy * cy + flat * flat * _TWELFTH
+    )
+
+
+@wp.func
+def punch_of(area: Area, flat: wp.float64, cell: wp.float64, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.vec4d:
+    """``flat_punch`` of nodes of ``cell`` [m²] each; stiffness over the root of their number."""
+    moments = cell / flat * moments_of(area, _1 / area.nodes, flat)
+    result = flat_punch(
+        area.nodes * cell, area.crossings * _CROSSING * wp.sqrt(cell), moments[0], moments[1], moments[2], law, pad
+    )
+    result[0] = result[0] / wp.sqrt(area.nodes)
+    return result
 
 
 @wp.func
@@ -153,37 +218,73 @@ def regions(
     Of a region the force is a straight line over the depth; the force of the contact is the envelope of all these lines.
     """
     # Half a node stands for a tip between nodes.
-    radius = radius_of(_HALF, cell)
-    bins.lines[block, 0] = wp.vec3d(law[pad, 0] * radius * response_at(radius, law, pad)[0], _0, _0)
+    radius, response = radius_of(_HALF, cell), response_at(_0, law, pad)
+    tip = law[pad, 0] * radius * response_at(radius, law, pad)[0]
+    bins.lines[block, 0] = wp.vec3d(tip, _0, _0)
     count = wp.int32(1)
-    # Sums over all bins so far: nodes; x, y and squares; gaps; gaps with x, y and squares; gaps with powers of the nodes before.
-    nodes, x, y, square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
-    gaps, gap_x, gap_y, gap_square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+    area, wider = Area(), Area()
+    # Sums over all bins so far of gaps, of their squares, of gaps with x, y and products, and with powers of the nodes before.
+    gaps, square, gap_x, gap_y = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
+    gap_xx, gap_xy, gap_yy = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
     ranked, twice = wp.float64(0.0), wp.float64(0.0)
-    of_cell = (_1 + flat * flat) / _12
+    punch = wp.vec4d(tip / wp.sqrt(_HALF), _1, _12 * response[1] - _6, response[2])
+    root_start = wp.float64(0.0)
+    per_root = wp.vec4d()
     for k in range(_BINS):
-        if bins.sums[block, k][0] == _0:
+        if k % _PUNCH == 0:
+            # The stiffness at the end of the next bins, and its change per root of the nodes.
+            for m in range(_PUNCH):
+                if k + m < _BINS:
+                    wider = widened(wider, bins.sums[block, k + m], flat)
+            punch = punch + (wp.sqrt(area.nodes) - root_start) * per_root
+            root_start = wp.sqrt(area.nodes)
+            per_root = wp.vec4d()
+            if wider.nodes > area.nodes:
+                per_root = (punch_of(wider, flat, cell, law, pad) - punch) / (wp.sqrt(wider.nodes) - root_start)
+        sums = bins.sums[block, k] + Sums(_0)
+        if sums[0] == _0:
             continue
-        sums = bins.sums[block, k] / _NODE
-        more, dx, dy, dsquare = sums[0], sums[1], sums[2] * flat, sums[3] / _SQUARE_UNIT
-        gap = sums[4] / (_GAP_UNIT * more) * _HALF * deepest
-        before = wp.float64(nodes + _0)
-        nodes, x, y, square = nodes + more, x + dx, y + dy, square + dsquare
-        gaps, gap_x, gap_y, gap_square = gaps + gap * more, gap_x + gap * dx, gap_y + gap * dy, gap_square + gap * dsquare
+        before = wp.float64(area.nodes + _0)
+        gap = sums[6] / (_GAP_UNIT * sums[0]) * _HALF * deepest
+        area = widened(area, sums, flat)
+        weight = gap / _NODE
+        gaps += weight * sums[0]
+        square += gap * weight * sums[0]
+        gap_x += weight * sums[1]
+        gap_y += weight * sums[2] * flat
+        gap_xx += weight * sums[3]
+        gap_xy += weight * sums[4] * flat
+        gap_yy += weight * sums[5] * flat * flat
+        nodes = area.nodes
         ranked += gap * (nodes * nodes - before * before)
         twice += gap * (nodes * nodes * nodes - before * before * before)
-        cx, cy, mean = x / nodes, y / nodes, gaps / nodes
-        from_origin = cx * cx + cy * cy
-        about = gap_square / nodes - _2 * (cx * gap_x + cy * gap_y) / nodes + (from_origin + of_cell) * mean
-        spread = square / nodes - from_origin + of_cell
-        tilted = _HALF * about / spread
-        radius = radius_of(nodes, cell)
-        response = response_at(radius, law, pad)
-        bent = _2 * twice / (nodes * nodes * nodes) - _3 * ranked / (nodes * nodes) + mean
+        each = _1 / nodes
+        cx, cy, mean = area.x * each, area.y * each, gaps * each
+        moments = moments_of(area, each, flat)
+        xx, xy, yy = moments[0], moments[1], moments[2]
+        gx, gy = gap_x * each, gap_y * each
+        gxx = gap_xx * each - _2 * cx * gx + (cx * cx + _TWELFTH) * mean
+        gxy = gap_xy * each - cx * gy - cy * gx + cx * cy * mean
+        gyy = gap_yy * each - _2 * cy * gy + (cy * cy + flat * flat * _TWELFTH) * mean
+        gx -= cx * mean
+        gy -= cy * mean
+        inverse = _1 / (xx * yy - xy * xy)
+        bowl = _QUARTER * (yy * gxx - _2 * xy * gxy + xx * gyy) * inverse - _HALF * mean
+        spread = _1 / wp.max(square * each - mean * mean, _LEAST_VARIANCE)
+        tilt = wp.max((yy * gx * gx - _2 * xy * gx * gy + xx * gy * gy) * inverse * spread, _0)
+        round_share = _12 * bowl * bowl * spread
+        smooth = wp.min(tilt + round_share * round_share, _1)
+        within = _QUARTER * (yy + flat * flat * xx) * inverse * bowl
+        ranked_mean = ranked * each * each
+        root = wp.sqrt(nodes)
+        here = punch + (root - root_start) * per_root
+        joint = here[1] + _0
         mean += (
-            _3 * of_cell / spread * (_2 * tilted - mean) + (_12 * response[1] - _6) * (tilted - _HALF * mean) + response[2] * bent
+            within
+            + here[2] * (joint * bowl + (_1 - joint * joint) * (_1 - smooth) * _HALF * (ranked_mean - mean))
+            + here[3] * (_2 * twice * each * each * each - _3 * ranked_mean + mean)
         )
-        slope = law[pad, 0] * radius * response[0]
+        slope = here[0] * root
         offset = slope * wp.max(mean, _0)
         last = bins.lines[block, count - 1] + wp.vec3d(_0)
         if slope <= last[0]:
@@ -216,32 +317,6 @@ def force_at(bins: Bins, block: wp.int32, n: wp.int32, depth: wp.float64) -> wp.
 
 
 @wp.func
-def punch_radius(stiffness: wp.float64, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.float64:
-    """Radius [m] of the flat punch of a stiffness [N/m]."""
-    low, high = wp.int32(0), _LAST_ENTRY + 1
-    while high - low > 1:
-        middle = (low + high) / 2
-        if stiffness_of_entry(middle, law, pad) > stiffness:
-            high = wp.int32(middle)
-        else:
-            low = wp.int32(middle)
-    below, above = stiffness_of_entry(low, law, pad), stiffness_of_entry(high, law, pad)
-    a, b = radius_of_entry(low, law, pad), radius_of_entry(high, law, pad)
-    return a + (b - a) * wp.clamp((stiffness - below) / (above - below), _0, _1)
-
-
-@wp.func
-def radius_of_entry(k: wp.int32, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.float64:
-    root = wp.float64(k) / _ENTRIES
-    return law[pad, 1] * root * root
-
-
-@wp.func
-def stiffness_of_entry(k: wp.int32, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.float64:
-    return law[pad, 0] * radius_of_entry(k, law, pad) * law[pad, _FIRST_ENTRY + _ENTRY * k]
-
-
-@wp.func
 def tabulate(
     bins: Bins,
     block: wp.int32,
@@ -257,7 +332,7 @@ def tabulate(
 ):
     """Force and radius of a row at all depths of the table, one thread; ``flat``: ``add_node``."""
     count = regions(bins, block, deepest, flat, cell, law, pad)
-    n, n_before, n_after = wp.int32(0), wp.int32(0), wp.int32(0)
+    n, n_before, n_after, entry = wp.int32(0), wp.int32(0), wp.int32(0), wp.int32(0)
     for point in range(_POINTS):
         share = wp.float64(point) / _STEPS
         depth = deepest * share * share
@@ -267,4 +342,5 @@ def tabulate(
         n_after = region_at(bins, block, count, n_after, depth + step)
         force[row, point] = force_at(bins, block, n, depth)
         slope = _HALF * (force_at(bins, block, n_after, depth + step) - force_at(bins, block, n_before, depth - step)) / step
-        radius[row, point] = punch_radius(slope, law, pad)
+        entry = entry_of(slope, law, pad, entry)
+        radius[row, point] = punch_radius(slope, law, pad, entry)

@@ -42,6 +42,11 @@ class LayerResponse(NamedTuple):
         return stiffening, moment, bend
 
 
+def reduced_modulus(gelpad: GelpadSpec) -> float:
+    """E* = E / (1 − ν²) [Pa] of the gel under a rigid indenter."""
+    return gelpad.youngs_modulus / (1.0 - gelpad.poisson_ratio**2)
+
+
 def layer_response(gelpad: GelpadSpec) -> LayerResponse:
     """Table of a gel by Lebedev and Ufliand's integral equation (J. Appl. Math. Mech. 22, 1958)."""
     widest = math.sqrt(_WIDEST * gelpad.size[0] * gelpad.size[1] / math.pi)

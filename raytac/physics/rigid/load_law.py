@@ -9,7 +9,8 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import PadGrid, rest_height
-from raytac.physics.rigid.layer_response import layer_response
+from raytac.physics.rigid.layer_response import layer_response, reduced_modulus
+from raytac.physics.rigid.regions import region_lines
 from raytac.shapes.part import Part
 from raytac.shapes.underside import object_bounds, object_height
 from raytac.specs.sensor import GelpadSpec
@@ -19,13 +20,6 @@ _DEPTHS = np.linspace(0.0, 1.0, _TABLE) ** 2
 """Depths of the table over the pad's thickness."""
 SMOOTH = 0.15
 """Share of a depth, up and down, over which the growth of the force gives the radius."""
-_AT_EDGE = 1e-9
-"""Nodes within this of an edge of the pad are on it [m]."""
-
-
-def reduced_modulus(gelpad: GelpadSpec) -> float:
-    """E* = E / (1 − ν²) [Pa] of the gel under a rigid indenter."""
-    return gelpad.youngs_modulus / (1.0 - gelpad.poisson_ratio**2)
 
 
 HARD_FROM, HARD_RISE = 0.2, 20.0
@@ -91,13 +85,17 @@ class LoadLaw:
     A contact that covers a region Ω of the gel has, at a depth δ, the force k(Ω) (δ − ⟨gap⟩): k the stiffness of the flat punch Ω, ⟨gap⟩
     the mean of the gap at first touch under that punch's pressure (Betti's theorem). The true Ω is that of the greatest force (Barber,
     J. Elasticity 4, 1974, 171), so a region that is a little off gives nearly the same. Here Ω is sought among the regions where the gap
-    is below a level. Its stiffness is that of a disc of its area on the bonded layer, 2 E* a κ(a) with a = √(A/π). The pressure over its
-    mean is 1 + (12 m − 6)(ρ² − 1/2) + n P₂(x): m and n are ``moment`` and ``bend`` of ``LayerResponse``, ρ is the distance from the
-    region's centroid, ρ² 1/2 in the mean, and x the area of smaller gaps over the region's. On a round contact x is ρ². Under a face that
-    tilts it is not, and ρ keeps its middle in place.
+    is below a level.
 
-    So the law is that of the layer for flat punches, level or tilted, for paraboloids and for cones. Separate contacts count as one of
-    the same area. Near the bonded face the law grows without bound (``hard_back``). F is strictly increasing in δ and 0 at δ <= 0.
+    Its stiffness follows from its area, its perimeter and its second moments (``regions``), for a punch in one piece or in many. The
+    pressure over its mean is 1 + (12 m − 6)(ρ² − 1/2) + n P₂(x): m and n are ``moment`` and ``bend`` of ``LayerResponse``, ρ² is 1/2 in
+    the mean and grows as the square of the distance from the region's centroid, over that of the ellipse of its moments, and x is the
+    area of smaller gaps over the region's. On a round contact x is ρ². Under a face that tilts it is not, and ρ keeps its middle in
+    place. In pieces, x takes the part of ρ² as far as the gap is neither a tilt nor a bowl over all of them: then each piece has its rim.
+
+    So the law is that of the layer for flat punches, level or tilted, for paraboloids and for cones, and close to it for contacts of
+    other shapes and in pieces. Near the bonded face the law grows without bound (``hard_back``). F is strictly increasing in δ and 0 at
+    δ <= 0.
     """
 
     def __init__(
@@ -122,16 +120,21 @@ class LoadLaw:
         """Greatest depth that a press may have [m]."""
         self.depth = gelpad.thickness * _DEPTHS
         """Depths of the table [m], 0 to the pad's thickness, denser at the start."""
-        stiffness, offset = region_lines(gap, x, y, gelpad, cells=cells)
+        stiffness, offset, area = region_lines(gap, x, y, gelpad, cells=cells)
 
-        def force(depth: np.ndarray) -> np.ndarray:
-            return (stiffness * depth[:, None] - offset).max(axis=1)
+        def contact(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            forces = stiffness * depth[:, None] - offset
+            region = forces.argmax(axis=1)
+            return np.take_along_axis(forces, region[:, None], axis=1)[:, 0], area[region]
 
-        self.table = force(self.depth)
+        self.table = contact(self.depth)[0]
         """Normal force of the table, without the hard back [N]."""
         step = np.maximum(SMOOTH * self.depth, 1e-12)
-        self.radius = _punch_radius((force(self.depth + step) - force(self.depth - step)) / (2.0 * step), gelpad)
-        """Radius [m] of the flat punch whose force grows as fast, over ``SMOOTH`` of the depth."""
+        (less, narrower), (more, wider) = contact(self.depth - step), contact(self.depth + step)
+        self.radius = _punch_radius((more - less) / (2.0 * step), gelpad)
+        """Radius [m] of the disc whose force grows as fast, over ``SMOOTH`` of the depth."""
+        self.area = 0.5 * (narrower + wider)
+        """Area of contact [m²], over ``SMOOTH`` of the depth."""
 
     @property
     def greatest(self) -> float:
@@ -183,8 +186,12 @@ class LoadLaw:
         return self.force(depth) / depth
 
     def contact_radius(self, depth: float) -> float:
-        """Radius [m] of the disc of the contact's area at ``depth`` [m]; 0 out of contact."""
+        """Radius [m] of the disc that is as stiff at ``depth`` [m]; 0 out of contact."""
         return float(np.interp(depth, self.depth, self.radius)) if depth > 0.0 else 0.0
+
+    def contact_area(self, depth: float) -> float:
+        """Area of contact [m²] at ``depth`` [m]; 0 out of contact."""
+        return float(np.interp(depth, self.depth, self.area)) if depth > 0.0 else 0.0
 
     def shear_stiffness(self, depth: float) -> float:
         """Tangential force per displacement [N/m] at ``depth`` [m], see ``shear_stiffness``."""
@@ -193,53 +200,6 @@ class LoadLaw:
     def twist_stiffness(self, depth: float) -> float:
         """Torque per angle [N m/rad] at ``depth`` [m], see ``twist_stiffness``."""
         return float(twist_stiffness(np.asarray(self.contact_radius(depth)), self._gelpad))
-
-
-def region_lines(
-    gap: np.ndarray,
-    x: np.ndarray,
-    y: np.ndarray,
-    gelpad: GelpadSpec,
-    highest: float = np.inf,
-    levels: int = 1024,
-    cells: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Stiffness k [N/m] and k ⟨gap⟩ [N] of regions, (n,) each; F is max k δ − k ⟨gap⟩.
-
-    They are half a node, which stands for a tip between nodes, and all where the gap is below one of ``levels`` up to ``highest`` [m],
-    evenly spaced in their roots. Other arguments are those of ``LoadLaw``.
-    """
-    layer = layer_response(gelpad)
-    step_x, step_y = x[1] - x[0], y[1] - y[0]
-    highest = min(highest, layer.share.max() * gelpad.thickness)
-    j, i = np.nonzero(gap < highest)
-    g, x_near, y_near = gap[j, i], x[i], y[j]
-    weight = (cells_of(x, y, gelpad) if cells is None else cells)[j, i]
-    level = (np.sqrt(g / highest) * levels).astype(int)
-    sums = (weight * term for term in (1.0, x_near, y_near, x_near**2 + y_near**2, g))
-    of_level = np.array([np.bincount(level, term, levels) for term in sums])
-    *of_level, of_gap = of_level[:, of_level[0] > 0.0]
-    of_gap /= of_level[0]
-    # Over all nodes up to each level: number and means of x, y and r²; the same times the gap.
-    nodes, *first = np.cumsum(of_level, axis=1)
-    (cx, cy, square), (mean, gap_x, gap_y, gap_square) = np.array(first) / nodes, np.cumsum(of_gap * of_level, axis=1) / nodes
-    from_origin, of_cell = cx**2 + cy**2, (step_x**2 + step_y**2) / 12.0
-    gap_square += -2.0 * (cx * gap_x + cy * gap_y) + (from_origin + of_cell) * mean
-    spread = square - from_origin + of_cell
-    tilted = 0.5 * gap_square / spread  # mean of gap ρ²
-    within = 3.0 * of_cell / spread * (2.0 * tilted - mean)  # by the curvature within a cell
-    ranked, twice = (np.cumsum(of_gap * np.diff(nodes**n, prepend=0.0)) / nodes**n for n in (2, 3))
-    radius = np.sqrt(np.append(0.5, nodes) * step_x * step_y / np.pi)
-    stiffening, moment, bend = layer.at(radius)
-    under = within + mean + (12.0 * moment[1:] - 6.0) * (tilted - 0.5 * mean) + bend[1:] * (2.0 * twice - 3.0 * ranked + mean)
-    stiffness = 2.0 * reduced_modulus(gelpad) * radius * stiffening
-    return stiffness, stiffness * np.append(0.0, np.maximum(under, 0.0))
-
-
-def cells_of(x: np.ndarray, y: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:
-    """Cells for which each place stands, (Ny, Nx): 1, 1/2 on an edge, 1/4 in a corner."""
-    at_x, at_y = (np.where(np.abs(v) > 0.5 * size - _AT_EDGE, 0.5, 1.0) for v, size in zip((x, y), gelpad.size, strict=True))
-    return at_y[:, None] * at_x
 
 
 def _punch_radius(stiffness: np.ndarray, gelpad: GelpadSpec) -> np.ndarray:

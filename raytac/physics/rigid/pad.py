@@ -207,7 +207,7 @@ class RigidPad(PressPad):
             if e.stuck_shear is not None and e.shear is not None:
                 _, law = self._touch(b, e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.twist)
                 force[b, :2] = law.shear_stiffness(e.rig.depth) * (e.shear - e.stuck_shear)
-                area[b] = np.pi * law.contact_radius(e.rig.depth) ** 2
+                area[b] = law.contact_area(e.rig.depth)
                 torque[b] = law.twist_stiffness(e.rig.depth) * (e.twist - e.stuck_twist)
             if e.failed:
                 failed[b] = True

@@ -15,7 +15,7 @@ import warp as wp
 
 from raytac.physics.rigid.contact_rows import LAST, Rows, missing_row, place_of_gap
 from raytac.physics.rigid.cover_kernels import add_outline
-from raytac.physics.rigid.law_kernels import DEEPER, Bins, add_node, clear_bins, deepest_of, most_deepest, tabulate
+from raytac.physics.rigid.law_kernels import DEEPER, Bins, add_node, clear_bins, crossings_at, deepest_of, most_deepest, tabulate
 from raytac.physics.rigid.motion_kernels import is_finite
 from raytac.physics.rigid.node_kernels import (
     between_nodes,
@@ -297,7 +297,8 @@ def measure_pair(
                 row_xx += u[0] * u[0]
             if gap < below:
                 weight = wp.where(i0 + i == 0 or i0 + i == last_x, _HALF * cells, cells)
-                add_node(sums, larger(gap + depth, _0) * inverse, i0 + i, j0 + j, flat, weight)
+                crossings = crossings_at(gaps, i, j, nx, ny)
+                add_node(sums, larger(gap + depth, _0) * inverse, i0 + i, j0 + j, weight, crossings)
             i += across()
         s += row_s
         sv += row_s * v
@@ -305,7 +306,7 @@ def measure_pair(
         second += wp.vec3d(row_xx, row_x * v[0], row_n * v[0] * v[0])
         j += wp.block_dim() // across()
     area = wp.vec4i(i0, j0, nx, ny)
-    add_outline(shapes, pads, placed, block, lane, pad, level, area, gaps, work.ends[block], below, depth, inverse, flat, sums)
+    add_outline(shapes, pads, placed, block, lane, pad, level, area, gaps, work.ends[block], below, depth, inverse, sums)
     s, szz = total_of(s), total_of(szz)
     sx, sz, slope_x = total_of(su[0]), total_of(su[1] + sv[1]), total_of(su[2])
     sy, slope_y = total_of(sv[0]), total_of(sv[2])

@@ -10,8 +10,7 @@ import warp as wp
 
 from raytac.errors import InputError
 from raytac.gel.surface import make_grid
-from raytac.physics.rigid.layer_response import layer_response
-from raytac.physics.rigid.load_law import reduced_modulus
+from raytac.physics.rigid.layer_response import layer_response, reduced_modulus
 from raytac.physics.rigid.placed_kernels import Pads
 from raytac.physics.rigid.shape_kernels import Shapes
 from raytac.shapes.part import PART_KINDS, Part

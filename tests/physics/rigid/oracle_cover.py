@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from raytac.gel.surface import rest_height
-from raytac.physics.rigid.load_law import cells_of
+from raytac.physics.rigid.regions import cells_of
 from raytac.shapes.part import Part
 from raytac.shapes.underside import object_height
 from raytac.specs.sensor import GelpadSpec

@@ -12,9 +12,10 @@ import trimesh
 from raytac.errors import InputError
 from raytac.gel.surface import make_grid
 from raytac.physics.rigid.contacts import LAW_POINTS, PadContacts
-from raytac.physics.rigid.law_kernels import BINS
-from raytac.physics.rigid.layer_response import layer_response
-from raytac.physics.rigid.load_law import LoadLaw, region_lines
+from raytac.physics.rigid.law_kernels import BINS, PUNCH_BINS
+from raytac.physics.rigid.layer_response import reduced_modulus
+from raytac.physics.rigid.load_law import LoadLaw
+from raytac.physics.rigid.regions import region_lines
 from raytac.physics.rigid.search import PadSearch
 from raytac.se3 import rotations
 from raytac.shapes.part import Part, mesh_part, primitive
@@ -22,6 +23,7 @@ from raytac.shapes.relief import relief_part
 from raytac.shapes.underside import object_height, object_radius
 from raytac.specs import load_sensor
 from raytac.specs.sensor import GelpadSpec
+from tests.gel.layer_contact import ABSENT, Layer
 from tests.physics.rigid.oracle import PadOverlap
 from tests.physics.rigid.oracle_cover import Covered
 from tests.physics.rigid.oracle_pierced import BondedFace
@@ -32,6 +34,7 @@ FLAT = replace(DOME, dome_radius=(math.inf, math.inf))
 PRIMITIVES = "sphere", "capsule", "ellipsoid", "cylinder", "box", "cone", "torus"
 KINDS = (*PRIMITIVES, "plane", "ball_mesh", "ring_mesh", "open_mesh", "relief", "compound")
 REACH = 50e-6
+LAYER = Layer(384, 38.4e-3, FLAT.thickness, FLAT.poisson_ratio)
 
 
 def part_of(kind: str, rng: np.random.Generator) -> Part:
@@ -121,7 +124,8 @@ def same(one: PadContacts, other: PadContacts) -> None:
 def test_contacts_are_those_of_the_reference(gelpad: GelpadSpec) -> None:
     """250 random bodies on each gelpad: depth 1 µm, centroid 5 µm, force 0.5 %.
 
-    That is between the same levels of the gap. Of few nodes, more levels find a region of more force: by 1.5 nodes' share at most.
+    That is between the same levels of the gap. Of few nodes, more levels find a region of more force, and the stiffness of more of
+    them is computed: by two nodes' share and 1 % at most.
     """
     bodies, poses = pressed(gelpad, 250, seed=7)
     contacts = PadSearch([gelpad], bodies, num_envs=1).contacts(poses[None, None], np.array([0]), REACH)
@@ -147,17 +151,17 @@ def test_contacts_are_those_of_the_reference(gelpad: GelpadSpec) -> None:
         gap = np.maximum(touches.gap[0] + depth, 0.0)
         highest = 0.5 * contacts.deepest[k]
         cells = covered.cells(highest - depth)
-        slope, offset = region_lines(gap, touches.x[0], touches.y[0], gelpad, highest, BINS, cells)
+        slope, offset, _ = region_lines(gap, touches.x[0], touches.y[0], gelpad, highest, BINS, PUNCH_BINS, cells)
         force = (slope * depths[at, None] - offset).max(axis=1)
-        np.testing.assert_allclose(contacts.force[k, at], force, rtol=5e-3, err_msg=name)
         nodes = np.count_nonzero(touches.gap[0] < 0.0)
+        np.testing.assert_allclose(contacts.force[k, at], force, rtol=5e-3 if nodes >= 10 else 5e-2, err_msg=name)
         law = LoadLaw(gap, touches.x[0], touches.y[0], gelpad, cells=cells)
         finely = [law.force(d) for d in depths[at]]
-        np.testing.assert_allclose(contacts.force[k, at], finely, rtol=5e-3 + 1.5 / nodes, err_msg=name)
+        np.testing.assert_allclose(contacts.force[k, at], finely, rtol=1.5e-2 + 2.0 / nodes, err_msg=name)
         # Of contacts wider than the gel is thick, not all nodes count that the radius would need.
         for radius, d in zip(contacts.radius[k, at], depths[at], strict=True):
             wide = law.contact_radius(d) > gelpad.thickness
-            assert radius == pytest.approx(law.contact_radius(d), rel=(5e-2 if wide else 2e-2) + 2.0 / nodes), name
+            assert radius == pytest.approx(law.contact_radius(d), rel=(5e-2 if wide else 2e-2) + 3.0 / nodes), name
     assert missed <= 3
 
 
@@ -288,7 +292,9 @@ def test_nodes_on_the_edges_of_the_pad_stand_for_the_cells_on_it() -> None:
     pose[1, 1] = pose[2, 2] = -1.0
     pose[2, 3] = -0.1e-3
     contacts = search_one(FLAT, [primitive("plane")], pose[None])
-    assert np.pi * contacts.radius[0, -1] ** 2 == pytest.approx(FLAT.size[0] * FLAT.size[1], rel=1e-3)
+    x, y = (np.linspace(-0.5 * size, 0.5 * size, round(size / 0.8e-3) + 1) for size in FLAT.size)
+    whole = LoadLaw(np.zeros((len(y), len(x))), x, y, FLAT)
+    assert contacts.radius[0, -1] == pytest.approx(whole.contact_radius(0.1e-3), rel=1e-3)
 
 
 def test_the_hole_of_a_torus_and_the_hollow_of_a_cup_stay_open() -> None:
@@ -296,12 +302,10 @@ def test_the_hole_of_a_torus_and_the_hollow_of_a_cup_stay_open() -> None:
     ring[2, 3] = 1e-3 - 0.2e-3
     torus = search_one(FLAT, [primitive("torus", (5e-3, 1e-3))], ring[None])
     np.testing.assert_allclose(torus.centre[0, :2], 0.0, atol=1e-9)
-    k = int(np.argmin(np.abs(torus.deepest[0] * np.linspace(0.0, 1.0, LAW_POINTS) ** 2 - 0.2e-3)))
-    half = math.sqrt(
-        2 * 1e-3 * 0.2e-3 * float(np.interp(torus.radius[0, k], layer_response(FLAT).radius, layer_response(FLAT).share))
-    )
-    area = np.pi * (5e-3 + half) ** 2 - np.pi * (5e-3 - half) ** 2
-    assert np.pi * torus.radius[0, k] ** 2 == pytest.approx(area, rel=0.05)
+    line = LAYER.lines
+    across = 1e-6 - (np.hypot(line[None, :], line[:, None]) - 5e-3) ** 2
+    overlap = np.where(across > 0.0, 0.2e-3 - 1e-3 + np.sqrt(np.maximum(across, 0.0)), ABSENT)
+    assert forces(torus)[0] == pytest.approx(layer_force(overlap), rel=0.17)  # of a thin ring the law is as much too stiff
     walls = [
         primitive("box", size, translated(at))
         for size, at in (
@@ -314,7 +318,15 @@ def test_the_hole_of_a_torus_and_the_hollow_of_a_cup_stay_open() -> None:
     ]
     cup = search_one(FLAT, walls, translated((0.0, 0.0, 3e-3 - 0.2e-3))[None])
     assert cup.depth[0] == pytest.approx(0.2e-3, abs=1e-9)
-    assert np.pi * cup.radius[0, -1] ** 2 == pytest.approx(12e-3**2 - 10e-3**2, rel=0.25)
+    side = np.maximum(np.abs(line[None, :]), np.abs(line[:, None]))
+    rim = np.where((side > 5e-3) & (side < 6e-3), 0.2e-3, ABSENT)
+    assert forces(cup)[0] == pytest.approx(layer_force(rim), rel=0.12)
+
+
+def layer_force(overlap: np.ndarray) -> float:
+    """Force [N] of the bonded layer under an overlap on the nodes of ``LAYER``."""
+    pressure, _ = LAYER.press(overlap, 2e-4)
+    return float(pressure.sum()) * LAYER.pitch**2 * reduced_modulus(FLAT)
 
 
 def translated(at: tuple[float, float, float]) -> np.ndarray:
@@ -477,7 +489,11 @@ def test_a_force_does_not_jump_where_edges_pass_nodes(kind: str, along: str, gel
 def test_a_face_has_its_area_wherever_it_lies(kind: str) -> None:
     part, turn = FLAT_FACES[kind]
     contacts = search_one(FLAT, [part], swept(part, turn, FLAT, "x")[::20], reach=20e-6)
-    area = 8e-3 * 10e-3 if kind == "box" else 2.0 * 6e-3**2
-    np.testing.assert_allclose(np.pi * contacts.radius[:, -1] ** 2, area, rtol=0.01)
+    half = np.array([4e-3, 5e-3]) if kind == "box" else np.full(2, 6e-3) / math.sqrt(2.0)
+    line = np.arange(-7e-3, 7e-3, 0.05e-3)
+    face = np.where((np.abs(line)[None, :] < half[0]) & (np.abs(line)[:, None] < half[1]), 0.0, np.inf)
+    law = LoadLaw(face, line, line, FLAT)
+    np.testing.assert_allclose(contacts.radius[:, -1], law.contact_radius(0.1e-3), rtol=0.01)
     force = forces(contacts)
-    np.testing.assert_allclose(force, force.mean(), rtol=0.005)
+    np.testing.assert_allclose(force, [law.force(depth) for depth in contacts.depth], rtol=0.03)
+    np.testing.assert_allclose(force, force.mean(), rtol=0.007)
