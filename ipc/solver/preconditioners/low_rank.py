@@ -21,7 +21,7 @@ import warp as wp
 
 from ipc.arrays import FloatArray2d, IntArray, IntArray2d, MatArray2d, SingleArray3d, VecArray2d
 from ipc.contact.contacts import Contacts, mat34d, rows_of
-from ipc.solver.affine_elimination import affine_first, affine_part, is_affine
+from ipc.solver.affine_elimination import Elimination, affine_first, affine_part, finish_elimination
 from ipc.solver.blocks import wait_for_block
 from ipc.solver.linear import SystemView, row_column
 
@@ -290,8 +290,8 @@ def factor_affine(rest: Rest, system: SystemView, active: IntArray, small: Small
     good = wp.bool(True)
     for j in range(12):
         d = A[j, j]
-        for l in range(j):
-            d -= A[j, l] * A[j, l]
+        for n in range(j):
+            d -= A[j, n] * A[j, n]
         if not (d > wp.float64(0.0)):
             good = wp.bool(False)
             d = wp.float64(1.0)
@@ -299,16 +299,16 @@ def factor_affine(rest: Rest, system: SystemView, active: IntArray, small: Small
         A[j, j] = d
         for i in range(j + 1, 12):
             e = A[i, j]
-            for l in range(j):
-                e -= A[i, l] * A[j, l]
+            for n in range(j):
+                e -= A[i, n] * A[j, n]
             A[i, j] = e / d
     # L⁻¹ in the place of L.
     for j in range(12):
         A[j, j] = wp.float64(1.0) / A[j, j]
         for i in range(j + 1, 12):
             e = wp.float64(0.0)
-            for l in range(j, i):
-                e -= A[i, l] * A[l, j]
+            for n in range(j, i):
+                e -= A[i, n] * A[n, j]
             A[i, j] = e / A[i, i]
     for i in range(4):
         for j in range(4):
@@ -374,16 +374,16 @@ def factor_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
             i = e / m
             j = e - m * i
             total = wp.mat33d()
-            for l in range(m):
-                total += small.k[env, i, l] * small.a[env, l, j]
+            for n in range(m):
+                total += small.k[env, i, n] * small.a[env, n, j]
             small.product[env, i, j] = total
         wait_for_block()
         for e in range(lane, m * m, lanes):
             i = e / m
             j = e - m * i
             W = small.k[env, i, j]
-            for l in range(m):
-                W -= small.product[env, i, l] * small.k[env, l, j]
+            for n in range(m):
+                W -= small.product[env, i, n] * small.k[env, n, j]
             for p in range(3):
                 for q in range(3):
                     small.w[env, 3 * i + p, 3 * j + q] = W[p, q]
@@ -422,6 +422,16 @@ def contact_forces(rest: Rest, y: SingleArray3d, z: VecArray2d, running: IntArra
         for j in range(n):
             total += small.w[env, j, i] * small.t[env, j]
         small.force[env, i] = total
+
+
+@wp.kernel
+def eliminate_where_full(
+    e: Elimination, inverse: MatArray2d, small: Small, r: VecArray2d, running: IntArray, threads: wp.int32, z: VecArray2d
+):
+    """Affine bodies eliminated from 3×3 blocks, in environments with more contact nodes than there is room for."""
+    env, lane = wp.tid()
+    if running[env] != 0 and not fits(small, env):
+        finish_elimination(e, inverse, env, lane, threads, r, z)
 
 
 @wp.func

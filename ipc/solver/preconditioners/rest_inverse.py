@@ -2,8 +2,9 @@
 
 A bonded body has, in its own frame, one rest matrix K_0 = M/h² + K(rest) for every environment and step. It is inverted once
 (``substructure.py``), in single precision, and the contacts are added as a low-rank part (``low_rank.py``): M is exact as long as
-the body is at rest, and PCG deals with what deformation changes. Affine bodies are part of it with their own matrices, so that what a pad
-presses against moves with it. Free soft bodies, and environments with more contacts than there is room for, have block-Jacobi. Across a batch the application is a product of matrices that every environment shares. On CUDA
+the body is at rest, and PCG deals with what deformation changes. Affine bodies are part of it with their own matrices, so that what
+a pad presses against moves with it. Free soft bodies, and environments with more contacts than there is room for, have block-Jacobi.
+Across a batch the application is a product of matrices that every environment shares. On CUDA
 everything is a launch of fixed size on arrays of fixed address, so that it can be part of a graph.
 """
 
@@ -21,6 +22,7 @@ from ipc.contact.contacts import Contacts
 from ipc.settings import Settings
 from ipc.solver.affine_elimination import affine_nodes
 from ipc.solver.block_jacobi import BlockJacobi
+from ipc.solver.blocks import THREADS as BLOCK_THREADS
 from ipc.solver.linear import SystemView
 from ipc.solver.preconditioners.low_rank import (
     LANES,
@@ -28,6 +30,7 @@ from ipc.solver.preconditioners.low_rank import (
     Rest,
     Small,
     affine_motion,
+    eliminate_where_full,
     fits,
     rest_entry,
     scaled_force,
@@ -252,7 +255,7 @@ def scatter_inside(
 
 
 def room(batch: int) -> int:
-    """Contact nodes for which there is memory in each of so many environments."""
+    """Contact nodes for which each of so many environments has memory."""
     return int(min(MAX_CONTACTS, (CONTACT_BYTES / (4 * _BLOCK_BYTES * batch)) ** 0.5))
 
 
@@ -315,7 +318,7 @@ class RestInverse:
             Product(view, self.x, self.y, int(first), int(first), batch) for view, first in zip(views, firsts, strict=False)
         ]
         self._lay_out_patches([patch for body in bodies for patch in body.patches], count)
-        self.jacobi = BlockJacobi(layout, batch, lanes, device, eliminate=False)
+        self.jacobi = BlockJacobi(layout, batch, lanes, device)
 
     def _vectors(self, inputs: int, outputs: int) -> tuple[wp.array, wp.array]:
         """Padded inputs (B, inputs) and parts of outputs (parts, B, outputs) of a product."""
@@ -375,6 +378,10 @@ class RestInverse:
             self.to_interface.compute(running)
         inputs = [rest, inside, r, self.y_inside, small, self.jacobi.inverse, running]
         self._launch(gather_interface, r.shape, inputs, [self.x, z])
+        if self.jacobi.affine:
+            threads = self.jacobi.affine.threads
+            inputs = [self.jacobi.elimination, self.jacobi.inverse, small, r, running, threads]
+            wp.launch(eliminate_where_full, (self.batch, threads), inputs, [z], device=self.device, block_dim=BLOCK_THREADS)
         for product in self.products:
             product.compute(running)
         self.low_rank.find_forces(self.y, z, running)
