@@ -117,7 +117,7 @@ def between_nodes(
         k += 1
     across = vertex_of(beside[0], middle, beside[1], pads.pitch[level])
     along = vertex_of(beside[2], middle, beside[3], pads.pitch[level])
-    return wp.vec3d(across[0] + along[0], beside[1], along[1])
+    return wp.vec3d(across[0] + along[0], across[1], along[1])
 
 
 @wp.func
