@@ -157,16 +157,18 @@ def look_at_nodes(
 
 
 @wp.func
-def rises_at(gap: wp.array(dtype=wp.float64), k: wp.int32, step: wp.int32, at: wp.int32, count: wp.int32) -> wp.vec2d:
-    """Rises [m] from node k to those before and after on its line; inf where there is none.
+def rises_at(
+    gap: wp.array(dtype=wp.float64), k: wp.int32, step: wp.int32, at: wp.int32, count: wp.int32, here: wp.float64
+) -> wp.vec2d:  # fmt: skip
+    """Rises [m] from node k, with a gap ``here``, to those before and after on its line.
 
-    It is the ``at``-th of ``count`` nodes that are ``step`` apart in the window.
+    Inf where there is none. It is the ``at``-th of ``count`` nodes that are ``step`` apart in the window.
     """
     before, after = infinity(), infinity()
     if at > 0:
-        before = gap[k - step] - gap[k]
+        before = gap[k - step] - here
     if at < count - 1:
-        after = gap[k + step] - gap[k]
+        after = gap[k + step] - here
     return wp.vec2d(before, after)
 
 
@@ -242,9 +244,10 @@ def nodes_below(
         i = lane % across()
         while i < nx:
             k = j * nx + i
-            room = below - gap[k]
+            here = gap[k] + _0
+            room = below - here
             if room > -_INF:
-                p, q = rises_at(gap, k, 1, i, nx), rises_at(gap, k, nx, j, ny)
+                p, q = rises_at(gap, k, 1, i, nx, here), rises_at(gap, k, nx, j, ny, here)
                 rise_x, rise_y = larger(p[0], p[1]), larger(q[0], q[1])
                 # A node amid others that are below tells nothing of where they end.
                 if larger(rise_x, rise_y) > room and room + rise_x + rise_y >= _0:
@@ -255,9 +258,15 @@ def nodes_below(
                     bound = below + room - room_x - room_y
                     least = smaller(least, bound)
                     if bound <= below:
-                        x = wp.float64(i)
-                        x0, x1 = smaller(x0, x - extent(room_x, p[1], around)), larger(x1, x + extent(room_x, p[0], around))
-                        y0, y1 = smaller(y0, y - extent(room_y, q[1], around)), larger(y1, y + extent(room_y, q[0], around))
+                        x = wp.float64(i)  # an extent is at most ``around``, and takes a division
+                        if x - around < x0:
+                            x0 = smaller(x0, x - extent(room_x, p[1], around))
+                        if x + around > x1:
+                            x1 = larger(x1, x + extent(room_x, p[0], around))
+                        if y - around < y0:
+                            y0 = smaller(y0, y - extent(room_y, q[1], around))
+                        if y + around > y1:
+                            y1 = larger(y1, y + extent(room_y, q[0], around))
             i += across()
         j += wp.block_dim() // across()
     return least_of(least), wp.vec4d(least_of(x0), -least_of(-x1), least_of(y0), -least_of(-y1))

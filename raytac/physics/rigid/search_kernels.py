@@ -15,7 +15,7 @@ import warp as wp
 
 from raytac.physics.rigid.contact_rows import LAST, Rows, missing_row, place_of_gap
 from raytac.physics.rigid.cover_kernels import add_outline
-from raytac.physics.rigid.law_kernels import DEEPER, Bins, add_node, clear_bins, deepest_of, most_deepest, tabulate
+from raytac.physics.rigid.law_kernels import DEEPER, NODE, Bins, add_node, clear_bins, deepest_of, most_deepest, tabulate
 from raytac.physics.rigid.motion_kernels import is_finite
 from raytac.physics.rigid.node_kernels import (
     between_nodes,
@@ -277,15 +277,16 @@ def measure_pair(
     total_of(_0)
     last_x, last_y = pads.nx[pad, level] - 1, pads.ny[pad, level] - 1
     flat, below, sums = step_y / step_x, _HALF * deepest - depth, work.bins.sums[block]
-    inverse = _1 / (_HALF * deepest)
+    inverse, most = _1 / (_HALF * deepest), -infinity()
     j = lane // across()
     while j < ny:
         v = pads.lines[fy + j0 + j] + wp.vec3d()
-        cells = wp.where(j0 + j == 0 or j0 + j == last_y, _HALF, _1)  # a node on an edge of the pad stands for half of one
+        cells = wp.where(j0 + j == 0 or j0 + j == last_y, _HALF, _1) * NODE  # a node on an edge of the pad is half of one
         row_s, row_n, row_x, row_xx = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
         i = lane % across()
         while i < nx:
             gap = gaps[j * nx + i] + _0
+            most = larger(most, gap)
             overlap = shift - gap
             if overlap > _0:
                 u = pads.lines[fx + i0 + i] + wp.vec3d()
@@ -305,7 +306,26 @@ def measure_pair(
         second += wp.vec3d(row_xx, row_x * v[0], row_n * v[0] * v[0])
         j += wp.block_dim() // across()
     area = wp.vec4i(i0, j0, nx, ny)
-    add_outline(shapes, pads, placed, block, lane, pad, level, area, gaps, work.ends[block], below, depth, inverse, flat, sums)
+    rise = -least_of(-most) - least_of(own_least)
+    add_outline(
+        shapes,
+        pads,
+        placed,
+        block,
+        lane,
+        lanes,
+        pad,
+        level,
+        area,
+        gaps,
+        work.ends[block],
+        below,
+        depth,
+        inverse,
+        flat,
+        rise,
+        sums,
+    )
     s, szz = total_of(s), total_of(szz)
     sx, sz, slope_x = total_of(su[0]), total_of(su[1] + sv[1]), total_of(su[2])
     sy, slope_y = total_of(sv[0]), total_of(sv[2])
