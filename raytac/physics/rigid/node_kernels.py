@@ -282,6 +282,27 @@ def box_around(
 
 
 @wp.func
+def nodes_in(
+    pads: Pads, placed: Placed, block: wp.int32, pad: wp.int32, level: wp.int32, below: wp.float64, box: wp.vec4d
+) -> wp.vec4i:
+    """First node and number of nodes along x and y of the ``window`` within a box [m].
+
+    ``box``: x from, to, y from, to; with one node beyond, for the law to know the node after the last that counts. From −inf: all.
+    """
+    area = window(pads, placed, block, pad, level, below)
+    i0, i1, j0, j1 = area[0], area[1], area[2], area[3]
+    if box[0] > -_INF:
+        fx, fy = pads.first_x[pad, level], pads.first_y[pad, level]
+        x0, y0 = pads.lines[fx][0], pads.lines[fy][0]
+        step_x, step_y = pads.lines[fx + 1][0] - x0, pads.lines[fy + 1][0] - y0
+        i0 = wp.max(i0, wp.int32(wp.floor((box[0] - x0) / step_x)))
+        i1 = wp.min(i1, wp.int32(wp.ceil((box[1] - x0) / step_x)) + 1)
+        j0 = wp.max(j0, wp.int32(wp.floor((box[2] - y0) / step_y)))
+        j1 = wp.min(j1, wp.int32(wp.ceil((box[3] - y0) / step_y)) + 1)
+    return wp.vec4i(i0, j0, wp.max(i1 - i0, 0), wp.max(j1 - j0, 0))
+
+
+@wp.func
 def is_convex(shapes: Shapes, placed: Placed, block: wp.int32) -> wp.bool:
     """True if one convex part alone is near: its gap to the resting gel, a cap, is convex."""
     parts, convex = wp.int32(0), wp.int32(1)
