@@ -18,6 +18,7 @@ import warp as wp
 from raytac.physics.rigid.contacts import LAW_POINTS
 from raytac.physics.rigid.layer_response import ENTRIES
 from raytac.physics.rigid.load_law import SMOOTH
+from raytac.physics.rigid.placed_kernels import larger, smaller
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
@@ -40,7 +41,7 @@ _SQUARE_UNIT = wp.constant(wp.float64(2.0**9))
 """Of a bin's sum of squares, over the spacing's square."""
 _SMOOTH = wp.constant(wp.float64(SMOOTH))
 _LEAST_STEP = wp.constant(wp.float64(1e-12))
-_NODE = wp.constant(wp.float64(1024.0))
+NODE = wp.constant(wp.float64(1024.0))
 """Parts of a node that are counted."""
 _1 = wp.constant(wp.float64(1.0))
 _2 = wp.constant(wp.float64(2.0))
@@ -111,30 +112,23 @@ def clear_bins(bins: Bins, block: wp.int32, lane: wp.int32, lanes: wp.int32):
 
 @wp.func
 def add_node(
-    sums: wp.array(dtype=Sums), share: wp.float64, i: wp.int32, j: wp.int32, flat: wp.float64, weight: wp.float64
+    sums: wp.array(dtype=Sums), share: wp.float64, i: wp.int32, j: wp.int32, flat: wp.float64, parts: wp.float64
 ):  # fmt: skip
     """Add node ``i``, ``j`` of a pad to the bins of a block, in any order.
 
-    ``share``: its gap at touch over the farthest that counts, in [0, 1). ``flat``: spacing along y over that along x. ``weight``: cells
-    for which the node stands; what is added to one node may be negative, and not their sum.
+    ``share``: its gap at touch over the farthest that counts, in [0, 1). ``flat``: spacing along y over that along x. ``parts``: of a
+    ``NODE``, for whose cells the node stands, a whole number; what is added to one node may be negative, and not their sum.
     """
     k = wp.min(wp.int32(wp.sqrt(share) * _SCALE), _BINS - 1)
-    parts = wp.floor(_NODE * weight + _HALF)
     x, y = wp.float64(i), wp.float64(j)
     square = wp.floor((x * x + y * y * flat * flat) * _SQUARE_UNIT + _HALF)
     wp.atomic_add(sums, k, parts * Sums(_1, x, y, square, wp.floor(share * _GAP_UNIT)))
 
 
 @wp.func
-def radius_of(nodes: wp.float64, cell: wp.float64) -> wp.float64:
-    """Radius [m] of a disc with the area of so many nodes, each of ``cell`` [m²]."""
-    return wp.sqrt(nodes * cell / _PI)
-
-
-@wp.func
 def response_at(radius: wp.float64, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.vec3d:
     """Stiffening, moment and bend of ``LayerResponse`` for a contact of a radius [m]."""
-    at = wp.min(wp.sqrt(radius / law[pad, 1]), _1) * _ENTRIES
+    at = smaller(wp.sqrt(radius / law[pad, 1]), _1) * _ENTRIES
     k = wp.min(wp.int32(at), _LAST_ENTRY)
     t = at - wp.float64(k)
     n = _FIRST_ENTRY + _ENTRY * k
@@ -153,38 +147,40 @@ def regions(
     Of a region the force is a straight line over the depth; the force of the contact is the envelope of all these lines.
     """
     # Half a node stands for a tip between nodes.
-    radius = radius_of(_HALF, cell)
+    disc = wp.sqrt(cell / _PI)  # radius of a disc with the area of one node
+    radius = wp.sqrt(_HALF) * disc
     bins.lines[block, 0] = wp.vec3d(law[pad, 0] * radius * response_at(radius, law, pad)[0], _0, _0)
     count = wp.int32(1)
     # Sums over all bins so far: nodes; x, y and squares; gaps; gaps with x, y and squares; gaps with powers of the nodes before.
     nodes, x, y, square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
     gaps, gap_x, gap_y, gap_square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
     ranked, twice = wp.float64(0.0), wp.float64(0.0)
-    of_cell = (_1 + flat * flat) / _12
+    of_cell, of_gap = (_1 + flat * flat) / _12, _HALF * deepest / _GAP_UNIT
     for k in range(_BINS):
         if bins.sums[block, k][0] == _0:
             continue
-        sums = bins.sums[block, k] / _NODE
+        sums = bins.sums[block, k] / NODE
         more, dx, dy, dsquare = sums[0], sums[1], sums[2] * flat, sums[3] / _SQUARE_UNIT
-        gap = sums[4] / (_GAP_UNIT * more) * _HALF * deepest
+        gap = sums[4] / more * of_gap
         before = wp.float64(nodes + _0)
         nodes, x, y, square = nodes + more, x + dx, y + dy, square + dsquare
         gaps, gap_x, gap_y, gap_square = gaps + gap * more, gap_x + gap * dx, gap_y + gap * dy, gap_square + gap * dsquare
         ranked += gap * (nodes * nodes - before * before)
         twice += gap * (nodes * nodes * nodes - before * before * before)
-        cx, cy, mean = x / nodes, y / nodes, gaps / nodes
+        each = _1 / nodes  # divisions take most of the time
+        cx, cy, mean = x * each, y * each, gaps * each
         from_origin = cx * cx + cy * cy
-        about = gap_square / nodes - _2 * (cx * gap_x + cy * gap_y) / nodes + (from_origin + of_cell) * mean
-        spread = square / nodes - from_origin + of_cell
-        tilted = _HALF * about / spread
-        radius = radius_of(nodes, cell)
+        about = (gap_square - _2 * (cx * gap_x + cy * gap_y)) * each + (from_origin + of_cell) * mean
+        spread = _1 / (square * each - from_origin + of_cell)
+        tilted = _HALF * about * spread
+        radius = wp.sqrt(nodes) * disc
         response = response_at(radius, law, pad)
-        bent = _2 * twice / (nodes * nodes * nodes) - _3 * ranked / (nodes * nodes) + mean
+        bent = (_2 * twice * each - _3 * ranked) * each * each + mean
         mean += (
-            _3 * of_cell / spread * (_2 * tilted - mean) + (_12 * response[1] - _6) * (tilted - _HALF * mean) + response[2] * bent
+            _3 * of_cell * spread * (_2 * tilted - mean) + (_12 * response[1] - _6) * (tilted - _HALF * mean) + response[2] * bent
         )
         slope = law[pad, 0] * radius * response[0]
-        offset = slope * wp.max(mean, _0)
+        offset = slope * larger(mean, _0)
         last = bins.lines[block, count - 1] + wp.vec3d(_0)
         if slope <= last[0]:
             continue
@@ -216,17 +212,21 @@ def force_at(bins: Bins, block: wp.int32, n: wp.int32, depth: wp.float64) -> wp.
 
 
 @wp.func
-def punch_radius(stiffness: wp.float64, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.float64:
-    """Radius [m] of the flat punch of a stiffness [N/m]."""
-    low, high = wp.int32(0), _LAST_ENTRY + 1
-    while high - low > 1:
-        middle = (low + high) / 2
-        if stiffness_of_entry(middle, law, pad) > stiffness:
-            high = wp.int32(middle)
-        else:
-            low = wp.int32(middle)
-    below, above = stiffness_of_entry(low, law, pad), stiffness_of_entry(high, law, pad)
-    a, b = radius_of_entry(low, law, pad), radius_of_entry(high, law, pad)
+def entry_below(at: wp.int32, stiffness: wp.float64, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.int32:
+    """The last entry that is not stiffer than that [N/m], searched for from one on."""
+    k = wp.int32(at)
+    while k > 0 and stiffness_of_entry(k, law, pad) > stiffness:
+        k -= 1
+    while k < _LAST_ENTRY and stiffness_of_entry(k + 1, law, pad) <= stiffness:
+        k += 1
+    return k
+
+
+@wp.func
+def punch_radius(low: wp.int32, stiffness: wp.float64, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.float64:
+    """Radius [m] of the flat punch of a stiffness [N/m], between an entry and the next one."""
+    below, above = stiffness_of_entry(low, law, pad), stiffness_of_entry(low + 1, law, pad)
+    a, b = radius_of_entry(low, law, pad), radius_of_entry(low + 1, law, pad)
     return a + (b - a) * wp.clamp((stiffness - below) / (above - below), _0, _1)
 
 
@@ -257,14 +257,15 @@ def tabulate(
 ):
     """Force and radius of a row at all depths of the table, one thread; ``flat``: ``add_node``."""
     count = regions(bins, block, deepest, flat, cell, law, pad)
-    n, n_before, n_after = wp.int32(0), wp.int32(0), wp.int32(0)
+    n, n_before, n_after, entry = wp.int32(0), wp.int32(0), wp.int32(0), wp.int32(0)
     for point in range(_POINTS):
         share = wp.float64(point) / _STEPS
         depth = deepest * share * share
-        step = wp.max(_SMOOTH * depth, _LEAST_STEP)
+        step = larger(_SMOOTH * depth, _LEAST_STEP)
         n = region_at(bins, block, count, n, depth)
         n_before = region_at(bins, block, count, n_before, depth - step)
         n_after = region_at(bins, block, count, n_after, depth + step)
         force[row, point] = force_at(bins, block, n, depth)
         slope = _HALF * (force_at(bins, block, n_after, depth + step) - force_at(bins, block, n_before, depth - step)) / step
-        radius[row, point] = punch_radius(slope, law, pad)
+        entry = entry_below(entry, slope, law, pad)
+        radius[row, point] = punch_radius(entry, slope, law, pad)

@@ -139,8 +139,9 @@ class CMujoco:
 
     def begin_step(self) -> None:
         """``mj_step1``."""
+        models, datas = self._models, self._datas
         for b in self._envs():
-            mujoco.mj_step1(self._models[b], self._datas[b])
+            mujoco.mj_step1(models[b], datas[b])
 
     def counts(self, envs: Sequence[int] | np.ndarray) -> list[tuple[int, int]]:
         """Contacts and rows that MuJoCo has, of each environment."""
@@ -148,9 +149,10 @@ class CMujoco:
 
     def free_acceleration(self) -> None:
         """As of ``Engine``; ``mj_step2`` gives the same."""
+        models, datas = self._models, self._datas
         for b in self._envs():
-            mujoco.mj_fwdActuation(self._models[b], self._datas[b])
-            mujoco.mj_fwdAcceleration(self._models[b], self._datas[b])
+            mujoco.mj_fwdActuation(models[b], datas[b])
+            mujoco.mj_fwdAcceleration(models[b], datas[b])
 
     def update_poses(self) -> None:
         """``mj_kinematics``."""
@@ -231,20 +233,23 @@ class CMujoco:
 
         Afterwards the models have their timestep again.
         """
-        envs, timestep = self._envs(), self._timestep
+        envs, timestep, step = self._envs(), self._timestep, self._damping.step
         models, datas, options, views = self._models, self._datas, self._options, self._views
         lengths, lost = views.length[: len(envs)].tolist(), views.lost[: len(envs)].tolist()
         for row, b in enumerate(envs):
             if lost[row]:
                 continue
-            options[b].timestep = lengths[row]
+            is_shorter = lengths[row] != timestep
+            if is_shorter:
+                options[b].timestep = lengths[row]
             try:
-                if not self._damping.step(b, models[b], datas[b]):
+                if not step(b, models[b], datas[b]):
                     mujoco.mj_step2(models[b], datas[b])
             except mujoco.FatalError:
                 self._lose(b, row)
             finally:
-                options[b].timestep = timestep
+                if is_shorter:
+                    options[b].timestep = timestep
 
     def _lose(self, env: int, row: int) -> None:
         if self._views.lost[row]:
