@@ -12,6 +12,7 @@ from raytac.cli.played import dataset_session, policy_session, scripted_session
 from raytac.cli.view import ViewArgs
 from raytac.dataset import DatasetPlan, PressDataset, render_dataset
 from raytac.errors import InputError
+from raytac.learn import shipped_policies
 from raytac.observe import ObservationSettings
 from raytac.specs import PressRanges, SweepSpec, load_press, load_sensor
 
@@ -84,7 +85,7 @@ def test_a_scripted_policy_plays_an_episode_to_its_end():
 
 
 def test_a_trained_policy_plays_without_pytorch():
-    session = policy_session(POLICIES / "balance_pole_ppo.pt", shown=SHOWN, device="cpu", physics=None)
+    session = policy_session(shipped_policies()["balance_pole_ppo"], shown=SHOWN, device="cpu", physics=None)
     assert session.title == "BalancePole · balance_pole_ppo.pt"
     for _ in range(20):
         assert session.advance()
