@@ -195,10 +195,9 @@ class SolverOptions(CommonOptions):
 
     def prepare_warp(self) -> None:
         """Call before contacts are first computed."""
-        if not self.verbose:
-            quiet_warp()
-            if not has_compiled_kernels():
-                logging.getLogger("raytac").info("compiling kernels: up to a minute, once on a machine")
+        quiet_warp(not self.verbose)
+        if not self.verbose and not has_compiled_kernels():
+            logging.getLogger("raytac").info("compiling kernels: up to a minute, once on a machine")
 
 
 @dataclass(frozen=True, kw_only=True)

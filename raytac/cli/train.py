@@ -32,8 +32,7 @@ class TrainArgs(PpoSettings):
     def run(self) -> int:
         from raytac.learn import train_policies
 
-        if not self.verbose:
-            quiet_warp()
+        quiet_warp(not self.verbose)
         out = self.out or Path("runs", "train", self.task if self.physics == "rigid" else f"{self.task}_{self.physics}")
         try:
             train_policies(self, out, device=self.device)

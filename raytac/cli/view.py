@@ -94,8 +94,7 @@ class ViewArgs(ShadowOptions):
         if session is None:
             scene = load_scene(self.scene)
             physics = chosen_physics(self.physics, self.level, scene)
-            if not self.verbose:
-                quiet_warp()
+            quiet_warp(not self.verbose)
             session = self._press(scene, physics) if isinstance(scene, PressScene) else self._task(scene, physics)
             menu = self._menu(scene)
         serving = {"folder": self.out, "host": self.host, "port": self.port, "allow_hosts": allowed}
@@ -137,8 +136,7 @@ class ViewArgs(ShadowOptions):
             return dataset_session(path)
         if self.policy is not None:
             check_known("policy", self.policy, ("scripted",))
-        if not self.verbose:
-            quiet_warp()
+        quiet_warp(not self.verbose)
         resolution = (_LONGEST, _LONGEST * 3 // 4) if self.resolution is None else parse_resolution(self.resolution)
         optics = OPTICS.config(self.optics, **self.chosen_shadows())
         shown = ObservationSettings(("rgb", "markers", "wrench"), resolution=resolution, optics=optics)
