@@ -13,7 +13,8 @@ A table stands in a page between a comment, which names a file of ``docs/measure
     <!-- end -->
 
 The first line is the heading. Each other line makes one row for every name in its first cell, joined by commas: ``*`` in the other cells
-stands for the name, and ``name = text`` shows another text. A line without ``*`` is one row. ``{key:format}`` is a value of the file.
+stands for the name, and ``name = text`` shows another text. A line without ``*`` is one row. ``{key:format}`` is a value of the file; of
+several files, ``table: ONE TWO``, keys begin with the file's name, as in ``{ONE.key}``.
 Above the table goes the command, the machine and the date, which ``--add`` keeps in the file beside the run's own keys.
 """
 
@@ -30,7 +31,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = ROOT / "docs"
 METRICS = PAGES / "measurements" / "metrics"
-BLOCK = re.compile(r"(<!-- table: (\w+)\n(.*?)\n-->\n)(.*?)(<!-- end -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- table: (\w+(?: \w+)*)\n(.*?)\n-->\n)(.*?)(<!-- end -->)", re.DOTALL)
 VALUE = re.compile(r"\{([\w.*+-]+)(:[^{}]*)?\}")
 COMMAND, DATE = "measured.command", "measured.date"
 
@@ -45,8 +46,12 @@ def filled(text: str, folder: Path = METRICS) -> str:
     """The page with all its tables made anew from the files of ``folder``."""
 
     def table(match: re.Match[str]) -> str:
-        values = read(folder / f"{match[2]}.json")
-        return f"{match[1]}\n{source(values)}\n\n{rows(match[3].splitlines(), values, match[2])}\n\n{match[5]}"
+        files = {name: read(folder / f"{name}.json") for name in match[2].split()}
+        values = dict(next(iter(files.values())))
+        if len(files) > 1:
+            values = {f"{name}.{key}": value for name, one in files.items() for key, value in one.items()}
+        said = "; ".join(dict.fromkeys(source(one) for one in files.values()))
+        return f"{match[1]}\n{said}\n\n{rows(match[3].splitlines(), values, match[2])}\n\n{match[5]}"
 
     return BLOCK.sub(table, text)
 

@@ -50,7 +50,8 @@ def test_pages_agree_with_their_metrics() -> None:
 
 
 def test_every_file_of_metrics_is_sound_and_shown_by_a_page() -> None:
-    shown = {match[2] for path in tables.pages() for match in tables.BLOCK.finditer(path.read_text(encoding="utf-8"))}
+    blocks = [match for path in tables.pages() for match in tables.BLOCK.finditer(path.read_text(encoding="utf-8"))]
+    shown = {name for match in blocks for name in match[2].split()}
     files = sorted(tables.METRICS.glob("*.json"))
     assert {path.stem for path in files} == shown
     for path in files:
@@ -64,6 +65,13 @@ def test_a_table_has_its_values_and_their_source(folder: Path) -> None:
     assert tables.filled(text, folder) == text and text.endswith("Text with {braces}.\n")
     (folder / "presses.json").write_text(json.dumps(VALUES | {"ball.force": 2.0}), encoding="utf-8")
     assert tables.filled(text, folder) != text
+
+
+def test_a_table_of_several_files_names_them_in_its_keys(folder: Path) -> None:
+    (folder / "again.json").write_text(json.dumps(VALUES | {"ball.force": 2.0}), encoding="utf-8")
+    page = "<!-- table: presses again\n| a | b |\n| {presses.ball.force} | {again.ball.force} |\n-->\n<!-- end -->\n"
+    text = tables.filled(page, folder)
+    assert "| 1.26 | 2.0 |" in text and text.count("raytac press ball") == 1
 
 
 def test_what_cannot_be_filled_is_named(folder: Path) -> None:

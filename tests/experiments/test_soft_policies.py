@@ -38,7 +38,7 @@ def test_tensors_have_their_strides_and_nothing_else_is_run(tmp_path: Path) -> N
 
 
 def test_a_policy_pushes_the_cube_on_rigid_pads_and_a_run_goes_on(tmp_path: Path) -> None:
-    """Success needs the right network: 251 of 256 in docs/measurements/learning.md."""
+    """Success needs the right network: 252 of 256 in docs/measurements/learning.md."""
     args = soft_policies.Args(policies="push_cube_ppo", episodes=4, num_envs=4, device="cpu", out=tmp_path)
     row = soft_policies.played("push_cube_ppo", "rigid", args)
     assert row["task"] == "PushCube" and row["successes"] >= 3 and row["failed"] == 0  # type: ignore[operator]
