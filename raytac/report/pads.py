@@ -169,7 +169,7 @@ def sheet_figure(presses: Sequence[PadPress], sensor: TactileSensor) -> Figure:
     import matplotlib
     from matplotlib.figure import Figure
 
-    left, right, bottom, top = camera_extent_mm(sensor.spec.camera)
+    view = camera_extent_mm(sensor.spec.camera)
     rows = {scene: [press for press in presses if press.scene == scene] for scene in dict.fromkeys(p.scene for p in presses)}
     pads = [press.pad for press in next(iter(rows.values()))]
     count, finest = len(pads), pads[-1]
@@ -186,7 +186,7 @@ def sheet_figure(presses: Sequence[PadPress], sensor: TactileSensor) -> Figure:
             deepest, highest = max(float(d.max()) for d in dents), min(float(d.min()) for d in dents)
             for axis, press in zip(line[:count], pressed, strict=True):
                 assert press.frame.rgb is not None
-                axis.imshow(press.frame.rgb[0], extent=(left, right, bottom, top))
+                axis.imshow(press.frame.rgb[0], extent=view)
             for axis, dent in zip(line[count : 2 * count], dents, strict=True):
                 shown = axis.imshow(dent, extent=extent, cmap="cividis", vmin=highest, vmax=deepest)
             bars = [figure.colorbar(shown, ax=list(line[count : 2 * count]), shrink=0.9, pad=0.01)]

@@ -94,6 +94,11 @@ def test_a_trained_policy_plays_without_pytorch():
     assert all(pad.rgb is not None for pad in shown.pads.values())
 
 
+def test_a_shipped_policy_is_viewed_by_its_name():
+    session = ViewArgs(scene="roll_ball_ppo", optics="phong", device="cpu")._played()
+    assert session is not None and session.title == "RollBall · roll_ball_ppo.pt" and session.advance()
+
+
 def test_a_policy_that_needs_pytorch_is_said_on_the_page(monkeypatch):
     monkeypatch.setattr(played, "_has_torch", lambda: False)
     session = policy_session(POLICIES / "push_cube_markers.pt", shown=SHOWN, device="cpu", physics=None)
