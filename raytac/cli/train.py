@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from raytac.cli.shared import print_paths
@@ -29,13 +29,17 @@ class TrainArgs(PpoSettings):
     verbose: bool = False
     """Let Warp, in which contacts are computed, list devices and the kernels that it loads."""
 
+    def __post_init__(self) -> None:
+        """Nothing: settings are checked by ``run``, whose errors are one line."""
+
     def run(self) -> int:
+        settings = PpoSettings(**{one.name: getattr(self, one.name) for one in fields(PpoSettings)})
         from raytac.learn import train_policies
 
         quiet_warp(not self.verbose)
         out = self.out or Path("runs", "train", self.task if self.physics == "rigid" else f"{self.task}_{self.physics}")
         try:
-            train_policies(self, out, device=self.device)
+            train_policies(settings, out, device=self.device)
         except KeyboardInterrupt:
             print("raytac: interrupted; the same command goes on from the last checkpoints", file=sys.stderr)
             return 130

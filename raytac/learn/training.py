@@ -14,7 +14,7 @@ import io
 import logging
 import time
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -325,5 +325,5 @@ def _settings(args: PpoSettings, touch: str, seed: int) -> dict[str, Any]:
         "episodes",
         "evaluate_every",
     )
-    kept = {one.name: getattr(args, one.name) for one in fields(PpoSettings) if one.name not in free}
+    kept = {name: value for name, value in asdict(args).items() if name not in free}
     return kept | {"touch": touch, "seed": seed, "history": HISTORY.get(args.task, 1) if args.history is None else args.history}

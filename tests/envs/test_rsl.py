@@ -15,6 +15,7 @@ pytest.importorskip("rsl_rl.algorithms", exc_type=ImportError)
 
 import torch
 
+from raytac.cli import main
 from raytac.envs import SCRIPTED, FlatPolicy, RollBallVectorEnv
 from raytac.envs.rsl import RslVecEnv
 from raytac.errors import InputError
@@ -161,3 +162,17 @@ def test_policies_that_are_shipped_fit_their_environments() -> None:
         vector = policy.vector(1)
         actions = policy(vector.buffers["actor"])
         assert actions.shape == vector.buffers["action"].shape and np.isfinite(actions).all()
+
+
+def test_the_command_trains_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    small = "--num-envs 4 --rollout 4 --minibatches 2 --epochs 1 --episodes 2 --hidden 8 --device cpu"
+    asked = ["train", "--task", "RollBall", *small.split(), "--out", str(tmp_path)]
+    assert main([*asked, "--steps", "16"]) == 0
+    assert capsys.readouterr().out.strip() == str(tmp_path / "metrics.json")
+    assert PolicyPlayer(tmp_path / "wrench/seed0/policy.pt").task == "RollBall"
+    assert main([*asked, "--steps", "32"]) == 0 and main([*asked, "--steps", "32"]) == 0
+    assert "done before" in capsys.readouterr().err
+    assert read_metrics(tmp_path / "metrics.json")["wrench.seed0.env_steps"] == 32
+    assert main([*asked, "--gamma", "1.5"]) == 2
+    assert capsys.readouterr().err.strip().splitlines()[-1].startswith("raytac: error: gamma = 1.5")
+    assert main([*asked, "--touch", "none,taste"]) == 2
