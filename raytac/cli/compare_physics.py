@@ -16,7 +16,7 @@ class ComparePhysicsArgs(SolverOptions):
     """Press the same objects into the rigid pad and into levels of the soft one.
 
     Writes report.html (one file: force, imprint, bulge, contact, differences of height and image to the finest level, times), sheet.png
-    (images, indentations, height differences) and metrics.json. Without --out the folder is runs/compare_physics. Needs raytac[ipc].
+    (images, indentations, height differences) and metrics.json. Without --out the folder is runs/compare_physics.
     """
 
     sensor: str = "gelsight_mini"
