@@ -235,9 +235,9 @@ def _page(presses: Sequence[PadPress], metrics: Mapping[str, Metric], facts: Map
 table{{border-collapse:collapse;font-size:13px}}th,td{{padding:.2rem .55rem;text-align:right;border-bottom:1px solid #e4e4e4}}
 td:first-child,td:nth-child(2){{text-align:left}}th{{background:#f5f5f5}}img{{max-width:100%}}</style></head><body>
 <h1>The same presses on rigid and soft pads</h1>
-<p>Each scene at its peak stage. Differences are to the {finest} soft pad: of height, root mean square, where both pads touch, within 1 mm of
-the contact of either, and 1 to 2 mm from it; of the image, mean absolute. The time of a press has its image in it, and that of a pad's first
-press what is made once.</p>
+<p>Each scene at its peak stage. Differences are to the {finest} soft pad: of height, root mean square, where both pads touch,
+within 1 mm of the contact of either, and 1 to 2 mm from it; of the image, mean absolute. The time of a press has its image in it,
+and that of a pad's first press what is made once.</p>
 <table><tr><th>scene</th><th>pad</th>{head}</tr>{"".join(lines)}</table>
 <p><img alt="Images, indentations and height differences" src="data:image/png;base64,{base64.b64encode(sheet).decode("ascii")}"></p>
 <table>{said}</table></body></html>
