@@ -192,7 +192,7 @@ def _no_denoiser() -> str:
 
 _VIEW = "import viser, websockets, msgspec; print('viser', viser.__version__)"
 _GPU = "import mujoco_warp; print('mujoco-warp imported')"
-_RL = "import gymnasium, mink; print('gymnasium', gymnasium.__version__)"
+_ENVS = "import gymnasium, mink; print('gymnasium', gymnasium.__version__)"
 
 PROBES = (
     Probe(
@@ -232,8 +232,8 @@ PROBES = (
         _absent("worlds on MuJoCo Warp, thousands on one GPU, need it", "mujoco_warp"),
     ),
     Probe(
-        "rl", _RL, False, "pip install 'raytac[rl]'",
-        _absent("raytac.envs and AddTactile need it", "gymnasium", "mink"),
+        "envs", _ENVS, False, "pip install 'raytac[envs]'",
+        _absent("raytac.envs, raytac play and AddTactile need it", "gymnasium", "mink"),
     ),
 )  # fmt: skip
 
