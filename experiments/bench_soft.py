@@ -19,7 +19,7 @@ A ball (3.155 mm, the scene "sphere") is pressed 0.8 mm into the GelSight Mini's
   symmetry of a mesh. The stand-off is taken out: the tool is lower by the mean gap, weighted by force, than the depth. Beside them what
   they cost: ``soft.<level>.solver_ms`` (a step of 0.1 mm, ball; processor time, on CUDA wall time), ``….newton`` and ``….pcg`` a step, and
   ``….least_det_f`` over the three. ``--forces`` leaves everything else out. ``--study`` adds ``soft.study.<name>.*`` of other gradings and
-  volume blocks, and of the coarse level at four other places.
+  volume blocks, and of the coarse and medium levels at four other places.
 - ``force.driven_error``, ``force.weight_error``: force on the case (bonded vertices) when 1 N is asked for; force on the coat under a free
   object of 0.3 N.
 """
@@ -69,8 +69,12 @@ STUDY = {
     "coarse_6_blocks_0": replace(COARSE, own_volume=0.0),
     "coarse_6_blocks_0.5": replace(COARSE, own_volume=0.5),
     "coarse_6_blocks_1": replace(COARSE, own_volume=1.0),
-    "medium_blocks_0": replace(MEDIUM, block=(2, 2, 1), own_volume=0.0),
-    "medium_blocks_1": replace(MEDIUM, block=(2, 2, 1), own_volume=1.0),
+    "medium_plain": replace(MEDIUM, block=None),
+    "medium_blocks_0": replace(MEDIUM, own_volume=0.0),
+    "medium_blocks_0.25": replace(MEDIUM, own_volume=0.25),
+    "medium_blocks_2": replace(MEDIUM, own_volume=2.0),
+    "medium_2_layers": replace(MEDIUM, block=(2, 2, 2)),
+    "medium_4_blocks": replace(MEDIUM, spread=4.0),
 }
 """Gradings, blocks and λ'/μ beside those of the levels."""
 PLACES = (-0.31e-3, 0.22e-3), (0.6e-3, -0.4e-3), (2.1e-3, 1.3e-3), (4.13e-3, 3.09e-3)
@@ -208,10 +212,11 @@ def force_errors(gelpad: GelpadSpec, levels: tuple[str, ...], device: str) -> di
 
 
 def studied(gelpad: GelpadSpec, fine: dict[str, float], device: str) -> dict[str, Metric]:
-    """Force errors and costs of ``STUDY``, and of the coarse level at ``PLACES``."""
+    """Force errors and costs of ``STUDY``, and of the coarse and medium levels at ``PLACES``."""
     flat = replace(gelpad, dome_radius=(math.inf, math.inf))
     runs = [(name, level, OFF_CENTRE) for name, level in STUDY.items()]
     runs += [(f"coarse_at_{1e3 * x:.2f}_{1e3 * y:.2f}", COARSE, (x, y)) for x, y in PLACES]
+    runs += [(f"medium_at_{1e3 * x:.2f}_{1e3 * y:.2f}", MEDIUM, (x, y)) for x, y in PLACES]
     runs += [(f"plain_at_{1e3 * x:.2f}_{1e3 * y:.2f}", STUDY["coarse_2.5_plain"], (x, y)) for x, y in PLACES]
     found: dict[str, Metric] = {}
     for name, level, place in runs:
