@@ -24,7 +24,7 @@ class StepReport:
         min_gap: least distance between surfaces over all accepted states [m]; inf if none was below d̂.
         min_det: least det F over all accepted states [-].
         newton, linear, line_search, relags: iterations.
-        projected: the Hessian had to be made positive semi-definite.
+        projected: the Hessian had to be made positive semi-definite in some iteration.
         ccd: least share of a Newton step that continuous collision detection allowed.
         speed: largest unknown's speed in the last Newton step [m/s], to compare with the tolerance.
         pairs: number of contact pairs at the end.

@@ -176,7 +176,7 @@ class World:
             linear=values["linear"].astype(np.int64),
             line_search=values["line_search"].astype(np.int64),
             relags=np.maximum(values["relags"], 0).astype(np.int64),
-            projected=host(pot.project).astype(bool),
+            projected=values["projected"].astype(bool),
             ccd=values["ccd"],
             speed=values["speed"],
             pairs=host(pot.collision.contacts.count).astype(np.int64),

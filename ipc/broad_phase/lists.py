@@ -73,9 +73,11 @@ def gap_bounds(candidates: Candidates, ee: wp.bool, env: wp.int32, i: wp.int32):
 
     With room for rounding.
     """
-    gap, moved = candidates.pt_gap[env, i] + wp.float64(0.0), wp.float64(2.0 + 1.0e-8) * candidates.moved[env]
+    gap, moved = wp.float64(0.0), wp.float64(2.0 + 1.0e-8) * candidates.moved[env]
     if ee:
         gap = candidates.ee_gap[env, i] + wp.float64(0.0)
+    else:
+        gap = candidates.pt_gap[env, i] + wp.float64(0.0)
     return wp.float64(1.0 - 1.0e-9) * gap - moved, wp.float64(1.0 + 1.0e-9) * gap + moved
 
 

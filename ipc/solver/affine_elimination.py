@@ -161,6 +161,8 @@ def couple_rows(e: Elimination, system: SystemView, contacts: Contacts, active: 
     if active[env] == 0:
         return
     for r in range(lane, rows_of(contacts, env), lanes):
+        if contacts.concave[env, r] != 0:
+            continue
         verts, row = contacts.row_verts[env, r], contacts.row[env, r]
         one = affine_first(system, verts, -1)
         if one >= 0:

@@ -47,6 +47,7 @@ def start_step(friction: wp.int32, d: Decisions, f: Flags):
     d.linear[env] = 0
     d.line_search[env] = 0
     d.project[env] = 0
+    d.projected[env] = 0
     d.speed[env] = zero
     d.last[env] = zero
     d.ccd[env] = wp.float64(1.0)
@@ -146,6 +147,7 @@ def after_solve(iterations: IntArray, negative: IntArray, mask: IntArray, d: Dec
         d.pcg_iterations[env] = d.pcg_iterations[env] + iterations[env]
         if negative[env] != 0 and d.project[env] == 0:
             d.project[env] = 1
+            d.projected[env] = 1
             again = 1
             f.again[0] = 1
     d.again[env] = again
@@ -348,6 +350,9 @@ def conclude(
                 d.stalled[env] = 1
                 d.active[env] = 0
             d.project[env] = 1
+            d.projected[env] = 1
+        else:
+            d.project[env] = 0
         # So small a step has converged, also where rounding of the energies kept it from being accepted.
         if slow and d.allowed[env] >= wp.float64(1.0):
             d.rested[env] = 1

@@ -3,9 +3,10 @@
 A Newton iteration has four parts:
 (i) While driven frames have not arrived, their motion enters the right-hand side, so that the unknowns make room for them in the same step.
 Frames and unknowns then move together as far as gaps allow.
-(ii) H p = −g is solved by PCG, with the exact Hessian first, and with a positive semi-definite one once negative curvature is met
-(projection on demand, after Longva et al. 2023, "Pitfalls of Projection"). It is solved loosely, as in inexact Newton methods (Dembo,
-Eisenstat, Steihaug 1982), and to the linear tolerance only where p is so small that it may be the last.
+(ii) H p = −g is solved by PCG, with the exact Hessian first, and with a positive semi-definite one if negative curvature is met
+(projection on demand, after Longva et al. 2023, "Pitfalls of Projection"), in each iteration anew: the definite one alone creeps. It is
+solved loosely, as in inexact Newton methods (Dembo, Eisenstat, Steihaug 1982), and to the linear tolerance only where p is so small that
+it may be the last.
 (iii) Continuous collision detection limits the step.
 (iv) The step is halved until the energy falls enough and no tetrahedron is inverted.
 

@@ -45,7 +45,8 @@ class Decisions:
     linear: IntArray
     line_search: IntArray
     relags: IntArray  # −1 before friction was lagged for the first time
-    project: IntArray  # its Hessian is made definite
+    project: IntArray  # its Hessian is made definite in this Newton iteration
+    projected: IntArray  # it was in any
     progress: FloatArray  # share of the frames' motion that is done
     trial_progress: FloatArray  # where the advance that is tried would end
     length: FloatArray  # of an advance, as a share of what remains

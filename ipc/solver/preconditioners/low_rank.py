@@ -122,6 +122,8 @@ def mark_contacts(system: SystemView, contacts: Contacts, rest: Rest, active: In
     if active[env] == 0:
         return
     for r in range(lane, rows_of(contacts, env), lanes):
+        if contacts.concave[env, r] != 0:
+            continue
         verts, row = contacts.row_verts[env, r], contacts.row[env, r]
         for k in range(4):
             v = verts[k]
@@ -233,7 +235,8 @@ def add_rows(system: SystemView, contacts: Contacts, rest: Rest, active: IntArra
     if active[env] == 0 or not fits(small, env):
         return
     for r in range(lane, rows_of(contacts, env), lanes):
-        add_row(env, system, contacts.row_verts[env, r], contacts.row[env, r], rest, small)
+        if contacts.concave[env, r] == 0:
+            add_row(env, system, contacts.row_verts[env, r], contacts.row[env, r], rest, small)
 
 
 @wp.func

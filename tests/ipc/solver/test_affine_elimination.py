@@ -40,7 +40,7 @@ def with_blocks_only(world: ipc.World) -> ipc.World:
 
 
 class Dense:
-    """H and M⁻¹ of the state of a world after a step as dense matrices over the unknowns, and the rows of its contacts."""
+    """H where it must be definite and M⁻¹ of a world after a step, dense over the unknowns, and the rows of its contacts."""
 
     def __init__(self, world: ipc.World, make: type[BlockJacobi] | type[RestInverse] = BlockJacobi) -> None:
         pot, layout = world._potential, world.layout
@@ -52,10 +52,10 @@ class Dense:
         rows = np.repeat(np.arange(n), np.diff(layout.row_start))
         blocks[rows, :, layout.col, :] = pot.system.blocks.numpy()[0][pot.where]
         contacts, R = pot.collision.contacts, pot.R.numpy()[0]
-        count = int(contacts.row_count.numpy()[0])
-        verts, values = contacts.row_verts.numpy()[0, :count], contacts.row.numpy()[0, :count]
-        self.q = np.zeros((count, n, 3))
-        for r in range(count):
+        kept = np.flatnonzero(contacts.concave.numpy()[0, : int(contacts.row_count.numpy()[0])] == 0)
+        verts, values = contacts.row_verts.numpy()[0, kept], contacts.row.numpy()[0, kept]
+        self.q = np.zeros((len(kept), n, 3))
+        for r in range(len(kept)):
             for k in range(4):
                 v = verts[r, k]
                 for m in range(layout.vert_count[v] if v >= 0 else 0):
@@ -244,14 +244,17 @@ def test_force_of_a_weight_does_not_depend_on_the_stiffness() -> None:
 
 
 def test_a_press_does_not_depend_on_the_one_before() -> None:
-    """An affine ball pressed hard, lifted and pressed lightly gives what a fresh one gives."""
+    """An affine ball pressed hard, lifted and pressed lightly gives what a fresh one gives.
+
+    Beside the middle: right above a vertex it would lie on a ridge, from which rounding takes it either way.
+    """
 
     def pressed(heights: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-        ball = ipc.AffineBody("ball", ipc.icosphere(4e-3, 2), pose=ipc.Pose((0, 0, 4.2e-3)), drive=1e3)
+        ball = ipc.AffineBody("ball", ipc.icosphere(4e-3, 2), pose=ipc.Pose((1.3e-4, 0.7e-4, 4.2e-3)), drive=1e3)
         settings = ipc.Settings(d_hat=1e-4, velocity_tolerance=1e-6, linear_tolerance=1e-6)
         world = ipc.World([bonded_pad(small_pad()), ball], settings, device="cpu")
         for height in heights:
-            world.set_target("ball", (0, 0, height))
+            world.set_target("ball", (1.3e-4, 0.7e-4, height))
             assert world.step().converged.all()
         return world.positions("pad")[0], world.contact_forces("ball")[0].sum(axis=0)
 
