@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 import ipc
 from experiments.running import recorded, run
-from ipc import start_warp
 from ipc.bodies import Layout, build_layout, rotation_matrix
 from ipc.contact import Collision
 from ipc.meshes import surface_of
@@ -174,7 +173,7 @@ def main(args: Args) -> None:
         raise InputError("envs", value=args.envs, rule="must be whole numbers from 1, joined by commas")
     if not args.seconds > 0:
         raise InputError("seconds", value=args.seconds, rule="must be positive")
-    start_warp()
+    ipc.start_warp()
     device = wp.get_device({"auto": "cuda" if wp.is_cuda_available() else "cpu"}.get(args.device, args.device))
     kind = "cuda" if device.is_cuda else "cpu"
     with recorded(args, "bench_broad", device=str(device), owned=("metrics.json",), packages=("warp-lang",)) as (_, metrics):
