@@ -86,7 +86,6 @@ print("matplotlib", matplotlib.__version__, "drew a figure; trimesh", trimesh.__
 _WARP = """
 import warp as wp
 from ipc import start_warp
-wp.config.log_level = wp.LOG_WARNING
 start_warp()
 print("Warp", wp.config.version, "on", ", ".join(str(device) for device in wp.get_devices()))
 """
