@@ -7,12 +7,13 @@
     python experiments/bench_rl.py --against ../raytac_b682ef2 --out runs/bench_rl_against
 
 Each checkout has a process of its own, which waits while the other makes its step: a load that comes and goes slows both alike. Of worlds
-a turn is several steps, as a training makes them, with its memory at hand. What is compared is processor time. The scenes are those of
-this checkout, made with what both offer; those of worlds are each checkout's own, with its own steps. Each process runs
+a turn is several steps, as a training makes them, with its memory at hand. What is compared is processor time, of all threads: those that
+wait for work count as well, so that wall time is compared too. The scenes are those of this checkout, made with what both offer; those of
+worlds are each checkout's own, with its own steps. Each process runs
 
     PYTHONPATH=CHECKOUT python experiments/turns.py SCENE
 
-and answers a line on its input by a line with the processor time of its next step [s].
+and answers a line on its input by a line with the processor and the wall time of its next step [s].
 """
 
 from __future__ import annotations
@@ -51,8 +52,8 @@ class Turn:
             text=True,
         )
 
-    def step(self) -> float:
-        """Processor time of the next step [s]; NaN for one that is not counted.
+    def step(self) -> tuple[float, float]:
+        """Processor and wall time of the next step [s]; NaN for one that is not counted.
 
         Raises ``ChildProcessError``: the process ended, with its last line.
         """
@@ -64,7 +65,8 @@ class Turn:
             pass
         for line in self._process.stdout:
             if line.startswith("seconds "):
-                return float(line.split()[1])
+                processor, wall = line.split()[1:]
+                return float(processor), float(wall)
         last = (self._process.stderr.read().strip() or "no message").splitlines()[-1]
         raise ChildProcessError(f"the step process ended with {self._process.wait()}: {last}")
 
@@ -78,10 +80,11 @@ def speedup(ours: Path, theirs: Path, scene: str, rounds: int = ROUNDS) -> dict[
 
     Returns:
         ``ms``, ``their_ms``: medians over the counted steps.    ``speedup``: ratio of the two.    ``least``, ``most``: of single rounds.
+        ``wall_speedup``: of wall times.
     """
     steps = steps_of(scene)
     turns = [Turn(ours, scene), Turn(theirs, scene)]
-    times = np.empty((rounds, steps, 2))
+    times = np.empty((rounds, steps, 2, 2))
     try:
         for k in range(rounds * steps):
             order = (0, 1) if k % 2 == 0 else (1, 0)
@@ -90,7 +93,7 @@ def speedup(ours: Path, theirs: Path, scene: str, rounds: int = ROUNDS) -> dict[
     finally:
         for turn in turns:
             turn.end()
-    counted = 1e3 * times[1:]
+    counted, wall = np.moveaxis(1e3 * times[1:], -1, 0)
     mine, other = np.nanmedian(counted, axis=(0, 1))
     single = np.divide(*np.nanmedian(counted, axis=1).T[::-1])
     return {
@@ -99,6 +102,7 @@ def speedup(ours: Path, theirs: Path, scene: str, rounds: int = ROUNDS) -> dict[
         "speedup": float(other / mine),
         "least": float(single.min()),
         "most": float(single.max()),
+        "wall_speedup": float(np.divide(*np.nanmedian(wall, axis=(0, 1))[::-1])),
     }
 
 
@@ -120,10 +124,12 @@ def in_turn(against: Path, scenes: dict[str, str], rounds: int = ROUNDS) -> dict
         except ChildProcessError as error:
             raise RaytacError(f"{scene}: {error}") from error
         metrics |= {f"{key}.processor_ms_per_step": values["ms"], f"{key}.processor_ms_per_step_{name}": values["their_ms"]}
-        metrics |= {f"{key}.speedup_vs_{name}": values["speedup"]}
+        metrics |= {f"{key}.speedup_vs_{name}": values["speedup"], f"{key}.wall_speedup_vs_{name}": values["wall_speedup"]}
         metrics |= {f"{key}.speedup_least": values["least"], f"{key}.speedup_most": values["most"]}
         print(
-            f"{key}: {values['ms']:.2f} ms against {values['their_ms']:.2f} of {name}, {values['speedup']:.2f} times", flush=True
+            f"{key}: {values['ms']:.2f} ms against {values['their_ms']:.2f} of {name}, {values['speedup']:.2f} times, "
+            f"{values['wall_speedup']:.2f} by wall time",
+            flush=True,
         )
     return metrics
 
@@ -241,11 +247,14 @@ def main(scene: str) -> None:
         if not sys.stdin.readline():
             return
         count = TOGETHER.get(kind, 1)
-        began = time.process_time()
+        began = time.process_time(), time.perf_counter()
         for _ in range(count):
             step()
-        seconds = (time.process_time() - began) / count
-        print("seconds", seconds if k % steps_of(scene) >= first else "nan", flush=True)
+        ended = time.process_time(), time.perf_counter()
+        seconds = [
+            (end - begin) / count if k % steps_of(scene) >= first else np.nan for begin, end in zip(began, ended, strict=True)
+        ]
+        print("seconds", *seconds, flush=True)
 
 
 if __name__ == "__main__":
