@@ -17,8 +17,8 @@ policy would hardly touch it, and contact is what costs. Medians over steps; ``p
 
 ``--against CHECKOUT`` makes control steps with policy of this checkout and of another one in turn, each with its own scene, and compares
 processor time, which other work on the machine changes less, and wall time (``turns.py``): ``push.<mode>.speedup_vs_<name>``, ``name``
-being the commit, with the extremes of ``--rounds`` rounds, and ``.wall_speedup_vs_<name>``. With ``ball`` among the modes steps of ``experiments/ball_rolling.py`` with the rigid
-pad take turns too: ``ball_rolling.rigid.speedup_vs_<name>``.
+being the commit, with the extremes of ``--rounds`` rounds, and ``.wall_speedup_vs_<name>``. With ``ball`` among the modes steps of
+``experiments/ball_rolling.py`` with the rigid pad take turns too: ``ball_rolling.rigid.speedup_vs_<name>``.
 
 With ``--device cuda`` worlds are those of MuJoCo Warp and all stays on the device, the policy in PyTorch too; keys begin with ``gpu.``
 and times are the mean over steps, since nothing waits in between.
