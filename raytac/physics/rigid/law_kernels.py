@@ -126,21 +126,20 @@ def add_node(
 
 
 @wp.func
-def response_at(radius: wp.float64, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.vec3d:
+def response_at(radius: wp.float64, law: wp.array(dtype=wp.float64)) -> wp.vec3d:
     """Stiffening, moment and bend of ``LayerResponse`` for a contact of a radius [m]."""
-    at = smaller(wp.sqrt(radius / law[pad, 1]), _1) * _ENTRIES
+    at = smaller(wp.sqrt(radius / law[1]), _1) * _ENTRIES
     k = wp.min(wp.int32(at), _LAST_ENTRY)
     t = at - wp.float64(k)
     n = _FIRST_ENTRY + _ENTRY * k
-    before = wp.vec3d(law[pad, n], law[pad, n + 1], law[pad, n + 2])
+    before = wp.vec3d(law[n], law[n + 1], law[n + 2])
     n += _ENTRY
-    return before + t * (wp.vec3d(law[pad, n], law[pad, n + 1], law[pad, n + 2]) - before)
+    return before + t * (wp.vec3d(law[n], law[n + 1], law[n + 2]) - before)
 
 
 @wp.func
 def regions(
-    bins: Bins, block: wp.int32, deepest: wp.float64, flat: wp.float64, cell: wp.float64, law: wp.array2d(dtype=wp.float64),
-    pad: wp.int32,
+    bins: Bins, block: wp.int32, deepest: wp.float64, flat: wp.float64, cell: wp.float64, law: wp.array(dtype=wp.float64),
 ) -> wp.int32:  # fmt: skip
     """Write the regions that are the contact into ``bins.lines``, by depth; how many.
 
@@ -149,7 +148,7 @@ def regions(
     # Half a node stands for a tip between nodes.
     disc = wp.sqrt(cell / _PI)  # radius of a disc with the area of one node
     radius = wp.sqrt(_HALF) * disc
-    bins.lines[block, 0] = wp.vec3d(law[pad, 0] * radius * response_at(radius, law, pad)[0], _0, _0)
+    bins.lines[block, 0] = wp.vec3d(law[0] * radius * response_at(radius, law)[0], _0, _0)
     count = wp.int32(1)
     # Sums over all bins so far: nodes; x, y and squares; gaps; gaps with x, y and squares; gaps with powers of the nodes before.
     nodes, x, y, square = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
@@ -174,12 +173,12 @@ def regions(
         spread = _1 / (square * each - from_origin + of_cell)
         tilted = _HALF * about * spread
         radius = wp.sqrt(nodes) * disc
-        response = response_at(radius, law, pad)
+        response = response_at(radius, law)
         bent = (_2 * twice * each - _3 * ranked) * each * each + mean
         mean += (
             _3 * of_cell * spread * (_2 * tilted - mean) + (_12 * response[1] - _6) * (tilted - _HALF * mean) + response[2] * bent
         )
-        slope = law[pad, 0] * radius * response[0]
+        slope = law[0] * radius * response[0]
         offset = slope * larger(mean, _0)
         last = bins.lines[block, count - 1] + wp.vec3d(_0)
         if slope <= last[0]:
@@ -212,33 +211,33 @@ def force_at(bins: Bins, block: wp.int32, n: wp.int32, depth: wp.float64) -> wp.
 
 
 @wp.func
-def entry_below(at: wp.int32, stiffness: wp.float64, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.int32:
+def entry_below(at: wp.int32, stiffness: wp.float64, law: wp.array(dtype=wp.float64)) -> wp.int32:
     """The last entry that is not stiffer than that [N/m], searched for from one on."""
     k = wp.int32(at)
-    while k > 0 and stiffness_of_entry(k, law, pad) > stiffness:
+    while k > 0 and stiffness_of_entry(k, law) > stiffness:
         k -= 1
-    while k < _LAST_ENTRY and stiffness_of_entry(k + 1, law, pad) <= stiffness:
+    while k < _LAST_ENTRY and stiffness_of_entry(k + 1, law) <= stiffness:
         k += 1
     return k
 
 
 @wp.func
-def punch_radius(low: wp.int32, stiffness: wp.float64, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.float64:
+def punch_radius(low: wp.int32, stiffness: wp.float64, law: wp.array(dtype=wp.float64)) -> wp.float64:
     """Radius [m] of the flat punch of a stiffness [N/m], between an entry and the next one."""
-    below, above = stiffness_of_entry(low, law, pad), stiffness_of_entry(low + 1, law, pad)
-    a, b = radius_of_entry(low, law, pad), radius_of_entry(low + 1, law, pad)
+    below, above = stiffness_of_entry(low, law), stiffness_of_entry(low + 1, law)
+    a, b = radius_of_entry(low, law), radius_of_entry(low + 1, law)
     return a + (b - a) * wp.clamp((stiffness - below) / (above - below), _0, _1)
 
 
 @wp.func
-def radius_of_entry(k: wp.int32, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.float64:
+def radius_of_entry(k: wp.int32, law: wp.array(dtype=wp.float64)) -> wp.float64:
     root = wp.float64(k) / _ENTRIES
-    return law[pad, 1] * root * root
+    return law[1] * root * root
 
 
 @wp.func
-def stiffness_of_entry(k: wp.int32, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.float64:
-    return law[pad, 0] * radius_of_entry(k, law, pad) * law[pad, _FIRST_ENTRY + _ENTRY * k]
+def stiffness_of_entry(k: wp.int32, law: wp.array(dtype=wp.float64)) -> wp.float64:
+    return law[0] * radius_of_entry(k, law) * law[_FIRST_ENTRY + _ENTRY * k]
 
 
 @wp.func
@@ -248,15 +247,14 @@ def tabulate(
     deepest: wp.float64,
     flat: wp.float64,
     cell: wp.float64,
-    law: wp.array2d(dtype=wp.float64),
-    pad: wp.int32,
+    law: wp.array(dtype=wp.float64),
     row: wp.int32,
     # outputs
     force: wp.array2d(dtype=wp.float64),
     radius: wp.array2d(dtype=wp.float64),
 ):
     """Force and radius of a row at all depths of the table, one thread; ``flat``: ``add_node``."""
-    count = regions(bins, block, deepest, flat, cell, law, pad)
+    count = regions(bins, block, deepest, flat, cell, law)
     n, n_before, n_after, entry = wp.int32(0), wp.int32(0), wp.int32(0), wp.int32(0)
     for point in range(_POINTS):
         share = wp.float64(point) / _STEPS
@@ -267,5 +265,5 @@ def tabulate(
         n_after = region_at(bins, block, count, n_after, depth + step)
         force[row, point] = force_at(bins, block, n, depth)
         slope = _HALF * (force_at(bins, block, n_after, depth + step) - force_at(bins, block, n_before, depth - step)) / step
-        entry = entry_below(entry, slope, law, pad)
-        radius[row, point] = punch_radius(entry, slope, law, pad)
+        entry = entry_below(entry, slope, law)
+        radius[row, point] = punch_radius(entry, slope, law)

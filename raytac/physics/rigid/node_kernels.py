@@ -173,27 +173,33 @@ def rises_at(
 
 
 @wp.func
-def fall_along(
-    gap: wp.array(dtype=wp.float64), k: wp.int32, step: wp.int32, at: wp.int32, count: wp.int32, rises: wp.vec2d, steep: wp.float64
-) -> wp.vec2d:  # fmt: skip
-    """Greatest fall [m] of a convex gap within a spacing of node k, by ``rises_at`` it.
-
-    Also for how many spacings around the node this must hold: 0.5, 1 beside the outline of body or window, 2 at the body's outline, which
-    may end in a tip that has no node on the next line.
+def fall_of(rises: wp.vec2d, steep: wp.float64) -> wp.float64:
+    """Greatest fall [m] of a convex gap within a spacing of a node, by its ``rises_at``.
 
     A convex function falls on one side of a node by no more than it rises on the other. A neighbour that is higher by more than ``steep``
     bounds nothing. It counts as one beyond the outline: the node on the other side bounds what is between.
+    """
+    low, high = smaller(rises[0], rises[1]), larger(rises[0], rises[1])
+    if high > steep and (low <= steep or high == _INF):
+        high = wp.where(low < _INF, low, steep)
+    return larger(high, _0)
+
+
+@wp.func
+def spacings_around(
+    gap: wp.array(dtype=wp.float64), k: wp.int32, step: wp.int32, at: wp.int32, count: wp.int32, rises: wp.vec2d, steep: wp.float64
+) -> wp.float64:  # fmt: skip
+    """For how many spacings around node k ``fall_of`` must hold; arguments as of ``rises_at``.
+
+    0.5, 1 beside the outline of body or window, 2 at the body's outline, which may end in a tip that has no node on the next line.
     """
     low, high, around = smaller(rises[0], rises[1]), larger(rises[0], rises[1]), wp.float64(1.0)
     if at > 1 and at < count - 2:
         if gap[k - 2 * step] - gap[k - step] <= steep and gap[k + 2 * step] - gap[k + step] <= steep:
             around = _HALF
-    if high > steep:
-        if at > 0 and at < count - 1 and (high == _INF or low <= steep):
-            around = _2
-        if low <= steep or high == _INF:
-            high = wp.where(low < _INF, low, steep)
-    return wp.vec2d(larger(high, _0), around)
+    if high > steep and at > 0 and at < count - 1 and (high == _INF or low <= steep):
+        around = _2
+    return around
 
 
 @wp.func
@@ -248,13 +254,12 @@ def nodes_below(
             room = below - here
             if room > -_INF:
                 p, q = rises_at(gap, k, 1, i, nx, here), rises_at(gap, k, nx, j, ny, here)
-                rise_x, rise_y = larger(p[0], p[1]), larger(q[0], q[1])
+                highest, fall_x, fall_y = larger(larger(p[0], p[1]), larger(q[0], q[1])), fall_of(p, steep), fall_of(q, steep)
                 # A node amid others that are below tells nothing of where they end.
-                if larger(rise_x, rise_y) > room and room + rise_x + rise_y >= _0:
-                    along_x, along_y = fall_along(gap, k, 1, i, nx, p, steep), fall_along(gap, k, nx, j, ny, q, steep)
-                    around = larger(along_x[1], along_y[1])
+                if highest > room and room + fall_x + fall_y >= _0:
+                    around = larger(spacings_around(gap, k, 1, i, nx, p, steep), spacings_around(gap, k, nx, j, ny, q, steep))
                     within = smaller(around, _1)
-                    room_x, room_y = room + within * along_y[0], room + within * along_x[0]
+                    room_x, room_y = room + within * fall_y, room + within * fall_x
                     bound = below + room - room_x - room_y
                     least = smaller(least, bound)
                     if bound <= below:

@@ -174,4 +174,4 @@ def fill_row(
             rows.normal[row] = wp.normalize(wp.vec3d(-slope_x / s, -slope_y / s, wp.float64(1.0)))
         else:
             place_of_gap(pads, pad, touch, row, rows)
-        tabulate(bins, block, touch.deepest, flat, pads.cell[pad, level], pads.law, pad, row, rows.force, rows.radius)
+        tabulate(bins, block, touch.deepest, flat, pads.cell[pad, level], pads.law[pad], row, rows.force, rows.radius)
