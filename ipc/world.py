@@ -165,10 +165,12 @@ class World:
             self._arrays.update()
             self.sums.expire()
         self._failed |= values["failed"].astype(bool)
+        self._expected &= values["halved"] == 0
         return StepReport(
             converged=values["converged"].astype(bool) | (~chosen & ~self._failed),
             failed=self._failed.copy(),
             stalled=values["stalled"].astype(bool),
+            halved=values["halved"],
             blocked=np.where(chosen | self._failed, 1.0 - values["progress"], 0.0),
             min_gap=values["min_gap"],
             min_det=values["min_det"],

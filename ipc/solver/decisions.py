@@ -373,10 +373,13 @@ def conclude(
 
 @wp.kernel
 def choose_good(d: Decisions, f: Flags):
-    """Returns environments that failed, and their frames, to the start of the step."""
+    """Returns environments that failed, or are to converge and have not, and their frames, to the start of the step."""
     env = wp.tid()
-    d.good[env] = d.alive[env] * (1 - d.failed[env])
+    lost = d.failed[env]
+    if d.alive[env] != 0 and d.converged[env] == 0 and d.keep[env] == 0:
+        lost = 1
+    d.good[env] = d.alive[env] * (1 - lost)
     d.converged[env] = d.converged[env] * d.good[env]
-    d.accepted[env] = d.failed[env]
-    if d.failed[env] != 0:
+    d.accepted[env] = lost
+    if lost != 0:
         d.progress[env] = wp.float64(0.0)

@@ -26,10 +26,6 @@ QUICK = [
     *("peg_in_hole_affine", "needle_nu_0495", "d_hat_1um_soft", "d_hat_1um_affine", "d_hat_1mm_soft"),
     *("start_gap_1nm_soft", "start_gap_1nm_affine", "start_gap_1nm_soft_on_affine"),
 ]
-FAILING = {
-    "mat_twist_10_turns": "the mat snaps: 1 of 160 steps does not converge",
-}
-"""Cases that the solver does not pass, with the cause. A test here that passes fails: take it off the list then."""
 LONG = {"blocked_drive": 250}
 """Newton iterations of cases that may take more than the others: det F falls to 0.015, and advances into the block are many."""
 SETUP = Setup()
@@ -50,14 +46,7 @@ def test_quick_cases_pass(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.xfail(reason=FAILING[name], strict=True)) if name in FAILING else name
-        for name in CASES
-        if name not in QUICK
-    ],
-)
+@pytest.mark.parametrize("name", [name for name in CASES if name not in QUICK])
 def test_slow_cases_pass(name: str) -> None:
     """Those that renew friction often take several solves a step."""
     check(name, CASES[name](SETUP), most=MAX_NEWTON if name in GROUPS["basic"] else 5 * MAX_NEWTON)

@@ -120,7 +120,7 @@ def jammed_edges(setup: Setup) -> Worst:
             ipc.AffineBody("upper", as_surface(mesh), drive=1e5),
             ipc.KinematicBody("lower", as_surface(wedge(True, 2.0, 1.0, 3.0))),
         ]
-        world = world_of(bodies, setup, d_hat=1e-5, kappa=100.0, friction=0.0, gravity=(0, 0, 0), max_newton=100)
+        world = world_of(bodies, setup, d_hat=1e-5, kappa=100.0, friction=0.0, gravity=(0, 0, 0), max_newton=100, halvings=0)
         for depth in (0.1, 0.2, 0.3, 0.4):
             world.set_target("upper", (0, 0, -depth))
             worst = run(world, 1, driven=True, jams=True)
