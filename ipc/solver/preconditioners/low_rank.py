@@ -34,7 +34,7 @@ LANES = 256
 
 @wp.struct
 class Rest:
-    """K_0⁻¹ between the interface nodes of every bonded body and between the four nodes of every affine body.
+    """K_0⁻¹ between the interface nodes of a bonded body and the nodes of an affine one.
 
     ``inverse`` holds the matrices of bonded bodies one after the other, row by row; unknown u of part p is entry u − first[p] of a matrix
     of width[p] that starts at start[p]. ``unknown`` (N,) is a node's first unknown or −1, ``part`` (N,) its matrix. s nodes may touch
@@ -136,7 +136,7 @@ def mark_contacts(system: SystemView, contacts: Contacts, rest: Rest, active: In
 
 @wp.kernel
 def place_contacts(rest: Rest, active: IntArray, small: Small):
-    """Numbers the contact nodes in the order of ``surface_node``, in which those of pads come first."""
+    """Numbers the contact nodes as ``surface_node`` has them, those of pads first."""
     env, s = wp.tid()
     if active[env] == 0 or small.touched[env, s] == 0:
         return
@@ -153,7 +153,10 @@ def place_contacts(rest: Rest, active: IntArray, small: Small):
 
 @wp.func
 def slot_of(env: wp.int32, rest: Rest, small: Small, first: wp.int32) -> wp.int32:
-    """Place of the first node of a touched affine body among the contact nodes; the others follow. −1: nothing touches it."""
+    """Place of an affine body's first node among the contact nodes, or −1.
+
+    The other three follow. −1: nothing touches it.
+    """
     if first >= 0:
         if small.touched[env, rest.surface[first]] != 0:
             return small.slot[env, rest.surface[first]]
@@ -274,7 +277,10 @@ def invert_small(
 
 @wp.kernel
 def factor_affine(rest: Rest, system: SystemView, active: IntArray, small: Small):
-    """L⁻¹ of every affine body; of the mean diagonal of its blocks where its matrix is not positive definite."""
+    """L⁻¹ of every affine body.
+
+    Where its matrix is not positive definite, that of the mean diagonal of its blocks.
+    """
     env, body = wp.tid()
     if active[env] == 0:
         return
@@ -408,7 +414,10 @@ def sum_of_parts(y: SingleArray3d, env: wp.int32, u: wp.int32) -> wp.float32:
 
 @wp.kernel
 def contact_forces(rest: Rest, y: SingleArray3d, z: VecArray2d, running: IntArray, lanes: wp.int32, small: Small):
-    """W t, one block of threads an environment; y holds K_0⁻¹ r of pads, z L⁻¹ r of affine nodes."""
+    """W t; y holds K_0⁻¹ r of pads, z L⁻¹ r of affine nodes.
+
+    One block of threads an environment.
+    """
     env, lane = wp.tid()
     if running[env] == 0 or not fits(small, env):
         return
@@ -431,7 +440,7 @@ def contact_forces(rest: Rest, y: SingleArray3d, z: VecArray2d, running: IntArra
 def eliminate_where_full(
     e: Elimination, inverse: MatArray2d, small: Small, r: VecArray2d, running: IntArray, threads: wp.int32, z: VecArray2d
 ):
-    """Affine bodies eliminated from 3×3 blocks, in environments with more contact nodes than there is room for."""
+    """Affine bodies eliminated from 3×3 blocks, in environments that do not fit."""
     env, lane = wp.tid()
     if running[env] != 0 and not fits(small, env):
         finish_elimination(e, inverse, env, lane, threads, r, z)
@@ -508,5 +517,8 @@ class LowRank:
             self._launch(factor_small, (self.batch, self.lanes), [rest, active, self.lanes, small], self.lanes)
 
     def find_forces(self, y: wp.array, z: wp.array, running: wp.array) -> None:
-        """``small.force`` = W J K_0⁻¹ r for the running environments, with K_0⁻¹ r in y (parts, B, n), L⁻¹ r in z (B, N)."""
+        """Compute ``small.force`` = W t for the running environments.
+
+        y (parts, B, n) holds K_0⁻¹ r of pads, z (B, N) L⁻¹ r of affine nodes.
+        """
         self._launch(contact_forces, (self.batch, self.lanes), [self.rest, y, z, running, self.lanes, self.small], self.lanes)

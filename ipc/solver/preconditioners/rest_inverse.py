@@ -180,7 +180,10 @@ def gather_interface(
     x: SingleArray2d,
     z: VecArray2d,
 ):
-    """r_Γ − Σ E_pᵀ r_p on the interface; z of nodes that have block-Jacobi, and L⁻¹ r of affine bodies."""
+    """r_Γ − Σ E_pᵀ r_p on the interface.
+
+    z of nodes that have block-Jacobi, and L⁻¹ r in the place of z of affine bodies.
+    """
     env, i = wp.tid()
     if running[env] == 0:
         return
@@ -212,7 +215,10 @@ def scatter_interface(
     z: VecArray2d,
     x_back: SingleArray2d,
 ):
-    """x_Γ = S⁻¹ g − S⁻¹ Jᵀ W J S⁻¹ g, and a copy for every patch that borders on the node; x of affine bodies."""
+    """x_Γ = S⁻¹ g − S⁻¹ Jᵀ W J S⁻¹ g, with a copy for every patch that borders on the node.
+
+    x of affine bodies.
+    """
     env, i = wp.tid()
     if running[env] == 0 or not fits(small, env):
         return
