@@ -9,7 +9,7 @@ everything is a launch of fixed size on arrays of fixed address, so that it can 
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
-# pyright: reportIndexIssue=false, reportInvalidTypeForm=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false
 
 from __future__ import annotations
 
