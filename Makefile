@@ -7,7 +7,7 @@ OUT ?= runs/demo
 # Compiled modules are kept, also where a container's image switches that off: tests start some hundred processes.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo check test test-random suite quick lint rules types docs clean
+.PHONY: demo check test test-random suite quick lint rules types docs tables clean
 
 TEST := $(BIN)/python -m pytest
 # The installation goes before what then runs beside each other.
@@ -56,6 +56,10 @@ $(VENV)/.types: $(SOURCES) pyproject.toml
 docs: $(VENV)/.installed-docs
 	$(BIN)/python docs/build/pages.py .site
 	$(BIN)/zensical build --strict --clean --config-file mkdocs.yml
+
+# Tables of the measurements, from docs/measurements/metrics.
+tables: $(VENV)/.installed
+	$(BIN)/python docs/build/tables.py
 
 clean:
 	rm -rf $(VENV) runs build dist site .site .pytest_cache .ruff_cache .hypothesis .import_linter_cache

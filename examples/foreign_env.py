@@ -1,6 +1,6 @@
 """How do I add touch to an environment that steps MuJoCo itself, such as a ``MujocoEnv`` of Gymnasium?
 
-Run: python examples/foreign_env.py (needs pip install 'raytac[rl]')
+Run: python examples/foreign_env.py (needs pip install 'raytac[envs]')
 
 ``Close`` knows nothing of raytac: it gets a model file with sensors in it, and what they feel is read from its states. Other libraries
 have the model and its state too: dm_control as ``physics.model.ptr`` and ``physics.data.ptr``.

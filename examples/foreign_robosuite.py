@@ -1,6 +1,6 @@
 """How do I add touch to an environment like robosuite's: dictionaries, four or five values a step, MuJoCo behind ``env.sim``?
 
-Run: python examples/foreign_robosuite.py (needs pip install 'raytac[rl]')
+Run: python examples/foreign_robosuite.py (needs pip install 'raytac[envs]')
 
 ``Lift`` has the shape of a robosuite environment and knows neither Gymnasium nor raytac; ``AsGymnasium`` is all that it needs.
 """

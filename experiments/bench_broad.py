@@ -173,8 +173,7 @@ def main(args: Args) -> None:
         raise InputError("envs", value=args.envs, rule="must be whole numbers from 1, joined by commas")
     if not args.seconds > 0:
         raise InputError("seconds", value=args.seconds, rule="must be positive")
-    wp.config.quiet = True  # pyright: ignore[reportAttributeAccessIssue]
-    wp.init()
+    ipc.start_warp()
     device = wp.get_device({"auto": "cuda" if wp.is_cuda_available() else "cpu"}.get(args.device, args.device))
     kind = "cuda" if device.is_cuda else "cpu"
     with recorded(args, "bench_broad", device=str(device), owned=("metrics.json",), packages=("warp-lang",)) as (_, metrics):

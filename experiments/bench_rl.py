@@ -15,10 +15,10 @@ of stable-baselines3's PPO, 2 x 64, in NumPy, with random weights,
 a tenth of whose first two actions is taken and whose third is replaced by what presses the pad onto the cube with about 1 N: a random
 policy would hardly touch it, and contact is what costs. Medians over steps; ``pressed`` says in how many environments the pad was touched.
 
-``--against CHECKOUT`` runs this script and the other checkout's own, with its own scenes and steps, by turns: ``--rounds`` rounds, each in
-processes of their own, the order changing from round to round. ``push.<mode>.speedup_vs_<name>`` is the median over rounds of the ratio
-of both figures, ``name`` being the commit, and ``.speedup_least`` and ``.speedup_most`` are the extremes. With ``ball`` among the modes
-``experiments/ball_rolling.py`` with the rigid pad takes turns too: ``ball_rolling.rigid.speedup_vs_<name>``.
+``--against CHECKOUT`` makes control steps with policy of this checkout and of another one in turn, each with its own scene, and compares
+processor time, which other work on the machine changes less, and wall time (``turns.py``): ``push.<mode>.speedup_vs_<name>``, ``name``
+being the commit, with the extremes of ``--rounds`` rounds, and ``.wall_speedup_vs_<name>``. With ``ball`` among the modes steps of
+``experiments/ball_rolling.py`` with the rigid pad take turns too: ``ball_rolling.rigid.speedup_vs_<name>``.
 
 With ``--device cuda`` worlds are those of MuJoCo Warp and all stays on the device, the policy in PyTorch too; keys begin with ``gpu.``
 and times are the mean over steps, since nothing waits in between.
@@ -48,8 +48,9 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.push_policy import MODES, Pusher
 from experiments.running import recorded, run
-from experiments.turns import commit
+from experiments.turns import in_turn
 from raytac.checks import check_known, check_whole
 from raytac.device import resolve_device
 from raytac.envs import PushCubeVectorEnv, RollBallVectorEnv
@@ -61,24 +62,12 @@ from raytac.report import machine
 from raytac.sensor import TactileSensor
 from raytac.shapes import object_height, primitive
 
-MODES: dict[str, ObservationSettings | None] = {
-    "none": None,
-    "fots": ObservationSettings(("markers",)),
-    "touch": ObservationSettings(("markers", "wrench")),
-    "table32": ObservationSettings(("rgb",), resolution=(32, 32), optics="taxim"),
-    "raytrace64": ObservationSettings(("rgb",), resolution=(64, 64), optics="raytrace"),
-    "raytrace320": ObservationSettings(("rgb",), resolution=(320, 240), optics="raytrace"),
-}
-
-
 TASKS = {"PushCube": ("push", PushCubeVectorEnv), "RollBall": ("roll", RollBallVectorEnv)}
 """Tasks with soft pads: the name in keys, and the vector of environments."""
 TIMED = ("fots", "table32", "raytrace64")
 """Modes that are timed if none is named."""
 ENGINES = ("auto", "mujoco", "mujoco_warp")
-BALL, BALL_KEY = "ball", "steps_per_s"
-BALL_STEPS = 3000
-"""Control steps of a ball's run: all goals."""
+BALL = "ball"
 FRAMES = {"table": "taxim", "raytrace": "raytrace"}
 """Optical mode of each."""
 
@@ -112,7 +101,7 @@ class Args(CommonOptions):
     against: Path | None = None
     """Checkout of another commit to take turns with."""
     rounds: int = 3
-    """Of turns."""
+    """Of turns, beside the first, which compiles and is not counted."""
 
 
 def main(args: Args) -> dict[str, Metric]:
@@ -193,84 +182,37 @@ def timed_soft(tactile: ObservationSettings | None, args: Args) -> dict[str, Met
 
 
 def compare(args: Args, names: Sequence[str]) -> dict[str, Metric]:
-    """Run this checkout and another one by turns and write the ratios of their figures."""
+    """Make steps of this checkout and of another one in turn and write the ratios of their times."""
     assert args.against is not None
     if args.frames:
         raise InputError("against", value=args.against, rule="is for environment steps, not for --frames")
-    if args.rounds < 1:
-        raise InputError("rounds", value=args.rounds, rule="must be 1 or more")
-    theirs, ours = args.against.resolve(), Path(__file__).resolve().parents[1]
-    if not (theirs / "experiments" / "bench_rl.py").is_file():
-        raise InputError("against", value=args.against, rule="must be a checkout of this project, with experiments/bench_rl.py")
-    name = commit(theirs)
-    figures: dict[str, dict[Path, list[float]]] = {mode: {ours: [], theirs: []} for mode in names}
-    with recorded(args, "bench_rl", owned=("metrics.json",), packages=("gymnasium",)) as (_, metrics):
-        for k in range(args.rounds):
-            for mode in names:
-                for checkout in (ours, theirs) if k % 2 == 0 else (theirs, ours):
-                    figures[mode][checkout].append(figure_of(checkout, mode, args))
-                own, other = (figures[mode][checkout][-1] for checkout in (ours, theirs))
-                print(
-                    f"round {k + 1} of {args.rounds}, {mode}: {own:.4g} against {other:.4g} steps/s, {own / other:.3g} times",
-                    flush=True,
-                )
-        metrics |= {
-            "envs": args.envs,
-            "steps": args.steps,
-            "rounds": args.rounds,
-            "commit": commit(ours),
-            "against": name,
-            **machine(),
-        }
-        for mode, runs in figures.items():
-            key = f"ball_rolling.rigid.{BALL_KEY}" if mode == BALL else f"push.{mode}.env_steps_per_s"
-            prefix, ratios = key.rpartition(".")[0], np.array(runs[ours]) / np.array(runs[theirs])
-            metrics |= {key: float(np.median(runs[ours])), f"{key}_{name}": float(np.median(runs[theirs]))}
-            metrics[f"{prefix}.speedup_vs_{name}"] = float(np.median(ratios))
-            metrics |= {f"{prefix}.speedup_least": float(ratios.min()), f"{prefix}.speedup_most": float(ratios.max())}
+    if args.device == "cuda":
+        raise InputError("device", value=args.device, rule="must be the CPU with --against", choices=("auto", "cpu"))
+    check_whole("rounds", args.rounds)
+    scenes = {f"push.{mode}": f"push:{mode}:{args.envs}" for mode in names if mode != BALL}
+    scenes |= {"ball_rolling.rigid": "ball:rigid"} if BALL in names else {}
+    with recorded(args, "bench_rl", device="cpu", owned=("metrics.json",), packages=("gymnasium",)) as (_, metrics):
+        metrics |= {"envs": args.envs, "rounds": args.rounds, **machine(), **in_turn(args.against, scenes, args.rounds + 1)}
     return metrics
-
-
-def figure_of(checkout: Path, mode: str, args: Args) -> float:
-    """Steps a second that a checkout's own script measures, in a process of its own."""
-    with tempfile.TemporaryDirectory() as out:
-        if mode == BALL:
-            command = ["experiments/ball_rolling.py", "--physics", "rigid", "--steps", str(BALL_STEPS)]
-            key = f"ball_rolling.rigid.{BALL_KEY}"
-        else:
-            sizes = ["--envs", str(args.envs), "--steps", str(args.steps)]
-            command, key = ["experiments/bench_rl.py", "--modes", mode, *sizes], f"push.{mode}.env_steps_per_s"
-        command = [sys.executable, *command, "--device", args.device, "--seed", str(args.seed), "--out", str(Path(out, "run"))]
-        ended = subprocess.run(
-            command, cwd=checkout, env={**os.environ, "PYTHONPATH": str(checkout)}, capture_output=True, text=True, check=False
-        )
-        if ended.returncode:
-            last = (ended.stderr.strip() or ended.stdout.strip() or "no message").splitlines()[-1]
-            raise RaytacError(f"{mode} in {checkout} ended with {ended.returncode}: {last}")
-        return float(read_metrics(Path(out, "run", "metrics.json"))[key])
 
 
 def timed(tactile: ObservationSettings | None, args: Args) -> dict[str, Metric]:
     """Keys of one mode."""
     env = PushCubeVectorEnv(args.envs, tactile=tactile, seed=args.seed, device=args.device)
-    observation, _ = env.reset(seed=args.seed)
-    policy = Policy(observation, env.single_action_space.shape[0])  # type: ignore[index]
+    pusher = Pusher(env, args.seed)
     wall, share, pressed = [], [], []
     for step in range(args.steps // 3 + args.steps):
         begin, before = time.perf_counter(), dict(env.batch.time_s)
-        action = policy(observation)
-        force = -env.batch.world.state().wrench["sensor"][:, 2]
-        action[:, :2] *= 0.1  # so that the pad stays on the cube
-        action[:, 2] = np.clip(0.3 * (force - 1.0), -1.0, 1.0)
+        action = pusher.action()
         acted = time.perf_counter()
-        observation = env.step(action)[0]
+        pusher.take(action)
         done = time.perf_counter()
         if step < args.steps // 3:
             continue
         spent = {name: value - before[name] for name, value in env.batch.time_s.items()}
         wall.append(done - begin)
         share.append((spent["physics"], spent["observation"], acted - begin))
-        pressed.append((force > 0.0).mean())
+        pressed.append((pusher.force > 0.0).mean())
     middle = np.median(np.array(share), axis=0)
     found = {f"{name}_ms": 1e3 * float(value) for name, value in zip(("physics", "observation", "policy"), middle, strict=True)}
     return {
@@ -412,27 +354,6 @@ def pressed_pads(sensor: TactileSensor, count: int, seed: int) -> GelSurface:
 def touched_share(surfaces: list[GelSurface]) -> float:
     """Share of the pads that are touched at all."""
     return float(np.mean([surface.contact.any(axis=(1, 2)).mean() for surface in surfaces]))
-
-
-class Policy:
-    """Two hidden layers of 64 with tanh on all observations, flat."""
-
-    def __init__(self, observation: dict[str, np.ndarray], actions: int) -> None:
-        rng, size = np.random.default_rng(0), self.flat(observation).shape[1]
-        sizes = (size, 64, 64, actions)
-        self.weights = [rng.normal(0.0, a**-0.5, (a, b)).astype(np.float32) for a, b in itertools.pairwise(sizes)]
-
-    @staticmethod
-    def flat(observation: dict[str, np.ndarray]) -> np.ndarray:
-        return np.concatenate(
-            [v.reshape(len(v), -1) / np.float32(255 if v.dtype == np.uint8 else 1) for v in observation.values()], axis=1
-        )
-
-    def __call__(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        values = self.flat(observation)
-        for weights in self.weights:
-            values = np.tanh(values @ weights)
-        return values.astype(float)
 
 
 if __name__ == "__main__":

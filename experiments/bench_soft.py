@@ -18,8 +18,9 @@ A ball (3.155 mm, the scene "sphere") is pressed 0.8 mm into the GelSight Mini's
   one of 1.5 mm 0.3 mm deep, on the pad without its dome and without friction, at a place (0.13, 0.09) mm off the middle that is on no
   symmetry of a mesh. The stand-off is taken out: the tool is lower by the mean gap, weighted by force, than the depth. Beside them what
   they cost: ``soft.<level>.solver_ms`` (a step of 0.1 mm, ball; processor time, on CUDA wall time), ``….newton`` and ``….pcg`` a step, and
-  ``….least_det_f`` over the three. ``--forces`` leaves everything else out. ``--study`` adds ``soft.study.<name>.*`` of other gradings and
-  volume blocks, and of the coarse level at four other places.
+  ``….least_det_f`` over the three. ``….drag.newton``, ``.pcg`` a step and ``.unconverged`` steps of a flat face of 3 mm that is dragged
+  0.6 mm deep over the domed pad, without friction. ``--forces`` leaves everything else out. ``--study`` adds ``soft.study.<name>.*`` of
+  other gradings and volume blocks, and of the coarse and medium levels at four other places.
 - ``force.driven_error``, ``force.weight_error``: force on the case (bonded vertices) when 1 N is asked for; force on the coat under a free
   object of 0.3 N.
 """
@@ -69,8 +70,12 @@ STUDY = {
     "coarse_6_blocks_0": replace(COARSE, own_volume=0.0),
     "coarse_6_blocks_0.5": replace(COARSE, own_volume=0.5),
     "coarse_6_blocks_1": replace(COARSE, own_volume=1.0),
-    "medium_blocks_0": replace(MEDIUM, block=(2, 2, 1), own_volume=0.0),
-    "medium_blocks_1": replace(MEDIUM, block=(2, 2, 1), own_volume=1.0),
+    "medium_plain": replace(MEDIUM, block=None),
+    "medium_blocks_0": replace(MEDIUM, own_volume=0.0),
+    "medium_blocks_0.25": replace(MEDIUM, own_volume=0.25),
+    "medium_blocks_2": replace(MEDIUM, own_volume=2.0),
+    "medium_2_layers": replace(MEDIUM, block=(2, 2, 2)),
+    "medium_4_blocks": replace(MEDIUM, spread=4.0),
 }
 """Gradings, blocks and λ'/μ beside those of the levels."""
 PLACES = (-0.31e-3, 0.22e-3), (0.6e-3, -0.4e-3), (2.1e-3, 1.3e-3), (4.13e-3, 3.09e-3)
@@ -203,17 +208,22 @@ def force_errors(gelpad: GelpadSpec, levels: tuple[str, ...], device: str) -> di
             if tool == "ball":
                 found |= {f"soft.{level}.{name}": value for name, value in cost.items()}
         found[f"soft.{level}.least_det_f"] = least
+        if level != "fine":
+            found |= {f"soft.{level}.drag.{name}": value for name, value in dragged(gelpad, level, device).items()}
         print(f"{level}: pressed by {', '.join(TOOLS)}", flush=True)
     return found
 
 
 def studied(gelpad: GelpadSpec, fine: dict[str, float], device: str) -> dict[str, Metric]:
-    """Force errors and costs of ``STUDY``, and of the coarse level at ``PLACES``."""
+    """Force errors and costs of ``STUDY``, and of the coarse and medium levels at ``PLACES``."""
     flat = replace(gelpad, dome_radius=(math.inf, math.inf))
     runs = [(name, level, OFF_CENTRE) for name, level in STUDY.items()]
     runs += [(f"coarse_at_{1e3 * x:.2f}_{1e3 * y:.2f}", COARSE, (x, y)) for x, y in PLACES]
+    runs += [(f"medium_at_{1e3 * x:.2f}_{1e3 * y:.2f}", MEDIUM, (x, y)) for x, y in PLACES]
     runs += [(f"plain_at_{1e3 * x:.2f}_{1e3 * y:.2f}", STUDY["coarse_2.5_plain"], (x, y)) for x, y in PLACES]
     found: dict[str, Metric] = {}
+    for name, level in STUDY.items():
+        found |= {f"soft.study.{name}.drag.{key}": value for key, value in dragged(gelpad, level, device).items()}
     for name, level, place in runs:
         for tool in TOOLS:
             force, cost = pressed(flat, level, tool, device, place)
@@ -228,16 +238,7 @@ def pressed(
 ) -> tuple[float, dict[str, float]]:
     """Normal force of a tool [N] at its depth without the stand-off, and what its steps cost."""
     thing, depth = TOOLS[tool]
-    mesh = pad_mesh(gelpad, level)
-    solid = scene_body("tool", object_parts(thing), "kinematic", sag=0.1 * mesh.d_hat).solid
-    assert isinstance(solid, ipc.KinematicBody)
-    surface = solid.surface
-    vertices = surface.vertices @ ipc.rotation_matrix(thing.quaternion).T
-    vertices[:, 2] -= vertices[:, 2].min()
-    start = 1.2 * mesh.d_hat
-    body = ipc.KinematicBody("tool", ipc.TriMesh(vertices, surface.faces), ipc.Pose((*place, start)))
-    settings = ipc.Settings(d_hat=mesh.d_hat, velocity_tolerance=5e-5)
-    world = ipc.World([pad_body(mesh, gelpad), body], settings, device=device)
+    world, start = under_tool(gelpad, level, thing, place, device)
 
     def step(height: float) -> ipc.StepReport:
         world.set_target("tool", (*place, height))
@@ -262,6 +263,37 @@ def pressed(
         "least_det_f": min(float(r.min_det[0]) for r in reports),
     }
     return float(world.wrench("tool").force[0, 2]), cost
+
+
+def under_tool(
+    gelpad: GelpadSpec, level: str | PadLevel, thing: ObjectSpec, place: tuple[float, float], device: str
+) -> tuple[ipc.World, float]:
+    """A pad without friction under a driven tool, and the height of the tool's lowest point [m]."""
+    mesh = pad_mesh(gelpad, level)
+    solid = scene_body("tool", object_parts(thing), "kinematic", sag=0.1 * mesh.d_hat).solid
+    assert isinstance(solid, ipc.KinematicBody)
+    surface = solid.surface
+    vertices = surface.vertices @ ipc.rotation_matrix(thing.quaternion).T
+    vertices[:, 2] -= vertices[:, 2].min()
+    start = 1.2 * mesh.d_hat
+    body = ipc.KinematicBody("tool", ipc.TriMesh(vertices, surface.faces), ipc.Pose((*place, start)))
+    settings = ipc.Settings(d_hat=mesh.d_hat, velocity_tolerance=5e-5)
+    return ipc.World([pad_body(mesh, gelpad), body], settings, device=device), start
+
+
+def dragged(gelpad: GelpadSpec, level: str | PadLevel, device: str) -> dict[str, float]:
+    """What six steps take in which a flat face of 3 mm, 0.6 mm deep, is dragged by 0.1 mm each, without friction."""
+    face = ObjectSpec("cylinder", {"radius": 3e-3, "length": 4e-3}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.05)
+    world, start = under_tool(gelpad, level, face, (0.0, 0.0), device)
+    reports = []
+    for k in range(1, 14):
+        world.set_target("tool", (0.0, STEP * max(k - 7, 0), start - (6 * STEP + start) * min(k, 7) / 7))
+        reports.append(world.step())
+    return {
+        "newton": sum(float(r.newton[0]) for r in reports[7:]) / 6,
+        "pcg": sum(float(r.linear[0]) for r in reports[7:]) / 6,
+        "unconverged": sum(int(not r.converged[0]) for r in reports),
+    }
 
 
 def layer_law(spec: SensorSpec) -> float:

@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.bench_rl import commit
 from experiments.running import recorded, run
+from experiments.turns import commit
 from raytac.checks import check_whole
 from raytac.errors import InputError, RaytacError
 from raytac.io import CommonOptions, Metric

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from experiments.running import recorded, run
-from raytac import quiet_warp
 from raytac.calibrate import contact_radius
 from raytac.device import resolve_device
 from raytac.gel import ElasticSurround, GelSurface
@@ -41,7 +40,6 @@ def main(args: Args) -> None:
     levels = parse_names(args.levels, "levels", PADS) if args.levels else ()
     depths, radius, sensor = [float(d) for d in args.depths_mm.split(",")], args.radius_mm / 1e3, load_sensor(args.sensor)
     device = resolve_device(args.device, ray_tracing=False)
-    quiet_warp()
     ball = ObjectSpec("sphere", {"radius": radius}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)
     scene = PressScene("ball", ball, (StageSpec("indent", depth=max(depths) / 1e3),))
     pads: dict[str, PressPad] = {"rigid": RigidPad(sensor, scene, pitch=PITCH)}

@@ -40,6 +40,7 @@ from raytac.io import CommonOptions, Metric
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ("README.md", "docs/guide/first-steps.md", "docs/guide/own-part.md", "docs/guide/compare.md")
 SKIPPED = {
+    r"git clone ADDRESS\b": "the checkout is cloned already",
     r"raytac view\b": "serves until it is interrupted",
     r"raytac compare\b.*--device cuda": "needs a GPU",
     r"raytac compare\b.*--(markers|level|full)": "takes longer than a first run, and says so",

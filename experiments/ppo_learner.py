@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,24 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureCNN
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
-from experiments.training import HELD_OUT, KINDS, PHYSICS, Evaluation
 from raytac.checks import check_known, check_number, check_numbers, check_seed, check_whole
-from raytac.envs import ProcessVecEnv, TactileVecEnv
+from raytac.envs import ProcessVecEnv, TactileVecEnv, TactileVectorEnv
 from raytac.errors import InputError
 from raytac.io import write_atomic
+from raytac.learn import KINDS, Evaluation, Outcome, evaluate, shown_beside
 from raytac.observe import ObservationSettings
+from raytac.physics import PHYSICS
 
-__all__ = ["SMALLEST_SIDE", "Checkpoint", "Learner", "Recipe", "evaluate", "tactile_settings"]
+__all__ = [
+    "SMALLEST_SIDE",
+    "Checkpoint",
+    "CheckpointPlayer",
+    "Learner",
+    "LearnerEpisodes",
+    "Recipe",
+    "evaluate_learner",
+    "tactile_settings",
+]
 
 SMALLEST_SIDE = 36
 """Smallest side of an image [px] for DQN's convolutions (``NatureCNN``, which ``MultiInputPolicy`` uses too)."""
@@ -81,7 +91,7 @@ class Recipe:
         ranges = {"learning_rate": "(0, inf)", "gamma": "[0, 1]", "gae_lambda": "[0, 1]", "clip_range": "(0, inf)"}
         for name, interval in (ranges | {"log_std_init": "(-inf, inf)", "ent_coef": "[0, inf)"}).items():
             check_number(name, getattr(self, name), interval)
-        check_known("physics", self.physics, PHYSICS)
+        check_known("physics", self.physics, PHYSICS.names)
         for name in ("task", "tactile", "device"):
             if not isinstance(getattr(self, name), str):
                 raise InputError(name, value=getattr(self, name), rule="must be a name")
@@ -198,7 +208,7 @@ class Checkpoint:
         except FileNotFoundError as error:
             raise InputError("checkpoint", value=path, rule="must be a file that exists") from error
         except Exception as error:
-            rule = f"must be a checkpoint of train_ppo, or of train_gpu with rsl_rl installed ({error})"
+            rule = f"must be a checkpoint of train_ppo ({error})"
             raise InputError("checkpoint", value=path, rule=rule) from error
 
 
@@ -329,24 +339,74 @@ def _checked_moments(name: str, rms: RunningMeanStd, saved: object) -> tuple[np.
     return mean, var, check_number(f"normaliser.{name}.count", saved["count"], "[0, inf)")
 
 
-def evaluate(learner: Learner, episodes: int, *, first_seed: int = 0) -> Evaluation:
-    """``episodes`` episodes from held-out seeds ``first_seed``, …, one a seed, as many at a time as there are environments."""
-    env = learner.model.get_env()
-    assert env is not None
-    learner.normaliser.training = False
-    returns, lengths, successes, failures = [], [], 0, 0
+class LearnerEpisodes:
+    """Held-out episodes of a learner's deterministic policy (``raytac.learn.Episodes``)."""
+
+    def __init__(self, learner: Learner) -> None:
+        """Freeze the normaliser."""
+        env = learner.model.get_env()
+        assert env is not None
+        self._learner, self._env, self.num_envs = learner, env, env.num_envs
+        learner.normaliser.training = False
+
+    @property
+    def control_timestep(self) -> float:
+        return self._vector.batch.control_timestep
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        return tuple(self._vector.batch.observers)
+
+    @property
+    def _vector(self) -> TactileVectorEnv:
+        base = self._learner.base
+        assert isinstance(base, TactileVecEnv) and isinstance(base.env, TactileVectorEnv)
+        return base.env
+
+    def reset(self, seed: int) -> None:
+        self._env.seed(seed)
+        self._seen = self._env.reset()
+
+    def step(self) -> Outcome:
+        self._seen, _, done, infos = self._env.step(self._learner.predict(self._seen))  # type: ignore[arg-type]
+        success, failed = (np.array([info[name] for info in infos], float) for name in ("success", "failed"))
+        return Outcome(self._learner.normaliser.get_original_reward(), done, success, failed)
+
+    def picture(self) -> np.ndarray:
+        pictures = self._vector.render()
+        assert pictures is not None
+        return pictures[0]
+
+
+def evaluate_learner(learner: Learner, count: int, *, first_seed: int = 0) -> Evaluation:
+    """As ``raytac.learn.evaluate``, in the learner's own environments."""
     try:
-        while len(returns) < episodes:
-            env.seed(HELD_OUT + first_seed + len(returns))
-            observation, running = env.reset(), np.arange(env.num_envs) < episodes - len(returns)
-            while running.any():
-                observation, _, done, infos = env.step(learner.predict(observation))  # type: ignore[arg-type]
-                for b in np.flatnonzero(running & done):
-                    returns.append(infos[b]["episode"]["r"])
-                    lengths.append(infos[b]["episode"]["l"])
-                    successes += infos[b]["success"]
-                    failures += infos[b]["failed"]
-                running &= ~done
+        return evaluate(LearnerEpisodes(learner), count, first_seed=first_seed)
     finally:
         learner.normaliser.training = True
-    return Evaluation(len(returns), successes, float(np.mean(returns)), float(np.mean(lengths)), failures)
+
+
+class CheckpointPlayer:
+    """Policy of a checkpoint (``raytac.learn.Player``)."""
+
+    def __init__(self, path: Path) -> None:
+        """Load it. Raises ``InputError`` for a file that is none."""
+        self._saved = Checkpoint.load(path)
+        recipe = self._saved.recipe
+        self.name, self.task, self.physics, self._recipe = path.stem, recipe.task, recipe.physics, recipe
+
+    def episodes(self, num_envs: int, *, physics: str, device: str, shown: Any = None) -> LearnerEpisodes:
+        """As ``Player``; of a policy that is given images, those are shown."""
+        device = "cpu" if device == "auto" else device
+        recipe, options = replace(self._recipe, processes=1, num_envs=num_envs, device=device), {"physics": physics}
+        hidden: list[str] = []
+        if shown is not None:
+            settings = tactile_settings(recipe.tactile, recipe.resolution)
+            felt = KINDS[recipe.task].task.tactile if settings == "task" else getattr(settings, "modalities", ())
+            options["render_mode"] = "rgb_array"
+            if "rgb" not in felt:
+                tactile, hidden = shown_beside(felt, shown)
+                options |= {"tactile": tactile, "pitch": 0.4e-3}
+        learner = Learner(recipe, hidden=hidden, **options)
+        learner.restore(self._saved)
+        return LearnerEpisodes(learner)

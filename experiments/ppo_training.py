@@ -25,10 +25,10 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
 from experiments.imitation import imitate
-from experiments.ppo_learner import Checkpoint, Learner, Recipe, evaluate
-from experiments.training import append_row, keep_rows, segment_seed
+from experiments.ppo_learner import Checkpoint, Learner, Recipe, evaluate_learner
 from raytac.errors import InputError
 from raytac.io import FolderLock
+from raytac.learn import append_row, keep_rows, segment_seed
 
 __all__ = ["Training"]
 
@@ -129,7 +129,7 @@ class Training:
     def _conclude(self) -> None:
         """Evaluate, write the checkpoint, and say how it is."""
         recipe = self.recipe
-        result = evaluate(self.learner, self._evaluation)
+        result = evaluate_learner(self.learner, self._evaluation)
         low, high = result.interval
         row = {
             "steps": self.steps, "wall_s": round(self._wall, 2), "episodes": result.episodes,

@@ -25,7 +25,6 @@ import numpy as np
 import tyro
 
 from experiments.running import recorded, run
-from raytac import quiet_warp
 from raytac.checks import check_number
 from raytac.device import resolve_device
 from raytac.errors import InputError, RaytacError
@@ -119,7 +118,6 @@ def main(args: Args) -> None:
             changed = replace(sensor, gelpad=replace(sensor.gelpad, **{field: value}))
             variants.append((f".{field.removesuffix('_ratio')}_{value:g}", changed))
     device = resolve_device(args.device, ray_tracing=False)
-    quiet_warp()
     ball = ObjectSpec("sphere", {"radius": args.radius_mm / 1e3}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)
     scene = PressScene("ball", ball, (StageSpec("indent", depth=float(measured.depth[-1])),))
     with recorded(args, "real_force", device=device) as (_, metrics):

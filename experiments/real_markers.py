@@ -29,7 +29,6 @@ import tyro
 from scipy import ndimage
 
 from experiments.running import recorded, run
-from raytac import quiet_warp
 from raytac.calibrate import PressedBall, pressed_balls
 from raytac.checks import check_number
 from raytac.device import resolve_device
@@ -236,7 +235,6 @@ def main(args: Args) -> None:
     circle = _circle(args.circle_px)
     drag = Drag.read(args.data)
     device = resolve_device(args.device, ray_tracing=False)
-    quiet_warp()
     sensor = photographed(load_sensor(args.sensor), drag.size, args.pitch_mm / 1e3)
     radius, pitch_um = args.ball_radius_mm / 1e3, 1e3 * args.pitch_mm
     ball = pressed_ball(sensor, circle, radius, device)

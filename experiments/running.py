@@ -18,6 +18,7 @@ import tyro
 from raytac.device import resolve_device
 from raytac.errors import InputError, RaytacError
 from raytac.io import VERSIONED, CommonOptions, Metric, result_folder, versions, write_atomic, write_metrics
+from raytac.report import machine
 
 __all__ = ["record_of", "recorded", "resumed", "run", "store"]
 
@@ -49,7 +50,7 @@ def recorded(
     start = time.perf_counter()
     out = args.out or out or Path("runs") / name
     device = resolve_device(args.device, ray_tracing=False) if device is None else device
-    metrics: dict[str, Metric] = {"experiment": name, "seed": args.seed, "device": device}
+    metrics: dict[str, Metric] = {"experiment": name, "seed": args.seed, "device": device, **machine()}
     with result_folder(out, (*owned, "metrics.json") if owned else ()) as folder:
         yield folder, metrics
         metrics |= versions((*VERSIONED, *packages))

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from experiments.running import resumed, run, store
-from experiments.training import KINDS
 from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.io import VERSIONED, CommonOptions, FolderLock, Metric, parse_names, versions, write_metrics
+from raytac.learn import KINDS
 from raytac.observe import MODALITIES, ObservationSettings
 from raytac.report import machine
 

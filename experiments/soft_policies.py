@@ -1,9 +1,9 @@
 """How do policies that were trained on rigid pads do on soft ones? Success on both, from the same held-out starts.
 
     python experiments/soft_policies.py --episodes 4 --num-envs 4
-    python experiments/soft_policies.py --policies experiments/policies/roll_ball_ppo.pt --episodes 64 --num-envs 64 --device cuda
+    python experiments/soft_policies.py --policies roll_ball_ppo --episodes 64 --num-envs 64 --device cuda
 
-Plays each policy as ``play.py --physics rigid`` and ``play.py --physics ipc`` do and writes, for each task and pads, ``success`` with its
+Plays each policy as ``raytac play --physics rigid`` and ``--physics ipc`` do and writes, for each task and pads, ``success`` with its
 95 % interval, ``return``, ``length``, ``failed`` (episodes that ended since the physics broke down) and ``minutes``. An interrupted run
 goes on where it stopped: ``rows.json`` has what was played.
 """
@@ -11,14 +11,14 @@ goes on where it stopped: ``rows.json`` has what was played.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-from experiments import play
 from experiments.running import recorded, resumed, run, store
-from experiments.training import PHYSICS
 from raytac.errors import InputError
 from raytac.io import CommonOptions, Metric, parse_names
+from raytac.learn import find_player, success_rate
+from raytac.physics import PHYSICS
 from raytac.report import machine
 
 _ROWS = "rows.json"
@@ -28,10 +28,8 @@ _ROWS = "rows.json"
 class Args(CommonOptions):
     """Play policies on rigid and on soft pads."""
 
-    policies: str = (
-        "experiments/policies/push_cube_ppo.pt,experiments/policies/roll_ball_ppo.pt,experiments/policies/balance_pole_ppo.pt"
-    )
-    """Files of ``train_gpu.py`` or ``train_ppo.py``, joined by commas; ``scripted:<task>`` is a task's scripted policy."""
+    policies: str = "push_cube_ppo,roll_ball_ppo,balance_pole_ppo"
+    """Shipped policies or files of ``raytac train``, joined by commas; ``scripted:<task>`` is a task's scripted policy."""
     episodes: int = 4
     """Episodes of each policy on each kind of pads."""
     num_envs: int = 4
@@ -49,7 +47,7 @@ def main(args: Args) -> dict[str, Metric]:
     kept.parent.mkdir(parents=True, exist_ok=True)
     with recorded(args, "soft_policies", device=device, packages=("gymnasium",)) as (_, metrics):
         for policy in names:
-            for physics in PHYSICS:
+            for physics in PHYSICS.names:
                 if any((row["policy"], row["physics"]) == (policy, physics) for row in rows):
                     continue
                 rows.append(played(policy, physics, args))
@@ -64,26 +62,15 @@ def main(args: Args) -> dict[str, Metric]:
 
 def played(policy: str, physics: str, args: Args) -> dict[str, Metric]:
     """Success of a policy on pads of one kind."""
-    given = play.Args(
-        policy=policy,
-        physics=physics,
-        episodes=args.episodes,
-        num_envs=args.num_envs,
-        film=False,
-        seed=args.seed,
-        device=args.device,
-    )
-    if policy.startswith("scripted:"):
-        given = replace(given, policy="scripted", task=policy.removeprefix("scripted:"))
-    elif not Path(policy).is_file():
-        raise InputError("policies", value=policy, rule="must be a file that exists, or scripted:<task>")
+    is_scripted = policy.startswith("scripted:")
+    player = find_player("scripted", policy.removeprefix("scripted:")) if is_scripted else find_player(policy)
     begin = time.perf_counter()
-    task, result = play.rate(given)
+    result = success_rate(player, args.episodes, num_envs=args.num_envs, physics=physics, device=args.device)
     low, high = result.interval
     return {
         "policy": policy,
         "physics": physics,
-        "task": task,
+        "task": player.task,
         "success": result.successes / result.episodes,
         "successes": result.successes,
         "success_low": low,

@@ -27,7 +27,6 @@ from pathlib import Path
 import numpy as np
 
 from experiments.running import resumed, run, store
-from raytac import quiet_warp
 from raytac.device import resolve_device
 from raytac.errors import InputError, SpecError
 from raytac.frame import TactileFrame
@@ -81,8 +80,6 @@ def main(args: Args) -> dict[str, Metric]:
     device = resolve_device(args.device, ray_tracing=False)
     out = args.out or Path("runs/stress")
     settings = {"seed": args.seed, "deepest": args.deepest, "pad": args.pad, "device": device}
-    if "ipc" in names:
-        quiet_warp()
     with FolderLock(out):
         kept = {name: resumed(out / f"{name}.json", settings) for name in names}
         metrics: dict[str, Metric] = {"experiment": "stress", "device": device, "seed": args.seed, "pad": args.pad, **machine()}

@@ -24,10 +24,10 @@ from pathlib import Path
 from typing import Any
 
 from experiments.running import run
-from experiments.training import PHYSICS, parse_seeds
 from raytac.checks import check_known
 from raytac.errors import InputError, RaytacError
-from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, versions, write_metrics
+from raytac.io import VERSIONED, CommonOptions, Metric, parse_names, parse_seeds, versions, write_metrics
+from raytac.physics import PHYSICS
 from raytac.report import machine
 
 TASKS = ("PushCube", "BalancePole", "LiftCube", "RollBall")
@@ -110,7 +110,7 @@ def main(args: Args) -> dict[str, Metric]:
     start = time.time()
     if args.task not in TASKS:
         raise InputError("task", value=args.task, rule="must be a known task", choices=TASKS)
-    check_known("physics", args.physics, PHYSICS)
+    check_known("physics", args.physics, PHYSICS.names)
     kinds = parse_names(args.tactile, "tactile")
     seeds = parse_seeds(args.seeds)
     from experiments.ppo_learner import Recipe, tactile_settings
@@ -150,7 +150,7 @@ def _train(job: _Job) -> None:
     """One training, up to its end or to the time that is given."""
     import torch
 
-    from experiments.ppo_learner import Recipe, evaluate
+    from experiments.ppo_learner import Recipe, evaluate_learner
     from experiments.ppo_training import Training
 
     torch.set_num_threads(1)
@@ -170,7 +170,7 @@ def _train(job: _Job) -> None:
             begin = time.time()
             training.run_segment()
             last = time.time() - begin
-        result = evaluate(training.learner, args.final_evaluation, first_seed=10**6)
+        result = evaluate_learner(training.learner, args.final_evaluation, first_seed=10**6)
         low, high = result.interval
         found: dict[str, Metric] = {
             "steps": training.steps, "training_wall_s": training.wall_s, "episodes": result.episodes, "failed": result.failures,

@@ -4,13 +4,16 @@
     python experiments/bench_ipc.py --sizes 300,1400 --against ../raytac_b682ef2 --out runs/bench_ipc_against
     python experiments/bench_soft.py --levels coarse --against ../raytac_b682ef2 --out runs/bench_soft_against
     python experiments/bench_optics.py --against ../raytac_b682ef2 --out runs/bench_optics_against
+    python experiments/bench_rl.py --against ../raytac_b682ef2 --out runs/bench_rl_against
 
-Each checkout has a process of its own, which waits while the other makes its step: a load that comes and goes slows both alike. What is
-compared is processor time. The scenes are those of this checkout, made with what both offer; each process runs
+Each checkout has a process of its own, which waits while the other makes its step: a load that comes and goes slows both alike. Of worlds
+a turn is several steps, as a training makes them, with its memory at hand. What is compared is processor time, of all threads: those that
+wait for work count as well, so that wall time is compared too. The scenes are those of this checkout, made with what both offer; those of
+worlds are each checkout's own, with its own steps. Each process runs
 
     PYTHONPATH=CHECKOUT python experiments/turns.py SCENE
 
-and answers a line on its input by a line with the processor time of its next step [s].
+and answers a line on its input by a line with the processor and the wall time of its next step [s].
 """
 
 from __future__ import annotations
@@ -30,6 +33,8 @@ import numpy as np
 
 ROUNDS = 3
 """Runs of a scene; the first compiles and is not counted."""
+TOGETHER = {"push": 20, "ball": 20}
+"""Steps of a turn, where it is not one."""
 
 
 class Turn:
@@ -47,8 +52,8 @@ class Turn:
             text=True,
         )
 
-    def step(self) -> float:
-        """Processor time of the next step [s]; NaN for one that is not counted.
+    def step(self) -> tuple[float, float]:
+        """Processor and wall time of the next step [s]; NaN for one that is not counted.
 
         Raises ``ChildProcessError``: the process ended, with its last line.
         """
@@ -60,7 +65,8 @@ class Turn:
             pass
         for line in self._process.stdout:
             if line.startswith("seconds "):
-                return float(line.split()[1])
+                processor, wall = line.split()[1:]
+                return float(processor), float(wall)
         last = (self._process.stderr.read().strip() or "no message").splitlines()[-1]
         raise ChildProcessError(f"the step process ended with {self._process.wait()}: {last}")
 
@@ -74,10 +80,11 @@ def speedup(ours: Path, theirs: Path, scene: str, rounds: int = ROUNDS) -> dict[
 
     Returns:
         ``ms``, ``their_ms``: medians over the counted steps.    ``speedup``: ratio of the two.    ``least``, ``most``: of single rounds.
+        ``wall_speedup``: of wall times.
     """
     steps = steps_of(scene)
     turns = [Turn(ours, scene), Turn(theirs, scene)]
-    times = np.empty((rounds, steps, 2))
+    times = np.empty((rounds, steps, 2, 2))
     try:
         for k in range(rounds * steps):
             order = (0, 1) if k % 2 == 0 else (1, 0)
@@ -86,7 +93,7 @@ def speedup(ours: Path, theirs: Path, scene: str, rounds: int = ROUNDS) -> dict[
     finally:
         for turn in turns:
             turn.end()
-    counted = 1e3 * times[1:]
+    counted, wall = np.moveaxis(1e3 * times[1:], -1, 0)
     mine, other = np.nanmedian(counted, axis=(0, 1))
     single = np.divide(*np.nanmedian(counted, axis=1).T[::-1])
     return {
@@ -95,11 +102,12 @@ def speedup(ours: Path, theirs: Path, scene: str, rounds: int = ROUNDS) -> dict[
         "speedup": float(other / mine),
         "least": float(single.min()),
         "most": float(single.max()),
+        "wall_speedup": float(np.divide(*np.nanmedian(wall, axis=(0, 1))[::-1])),
     }
 
 
-def in_turn(against: Path, scenes: dict[str, str]) -> dict[str, str | int | float | bool]:
-    """Metrics of scenes by their keys; prints a line for each.
+def in_turn(against: Path, scenes: dict[str, str], rounds: int = ROUNDS) -> dict[str, str | int | float | bool]:
+    """Metrics of scenes by their keys; prints a line for each. ``rounds``: as of ``speedup``.
 
     Raises ``InputError``: no checkout of this project.
     """
@@ -112,14 +120,16 @@ def in_turn(against: Path, scenes: dict[str, str]) -> dict[str, str | int | floa
     metrics: dict[str, str | int | float | bool] = {"against": name, "commit": commit(ours)}
     for key, scene in scenes.items():
         try:
-            values = speedup(ours, theirs, scene)
+            values = speedup(ours, theirs, scene, rounds)
         except ChildProcessError as error:
             raise RaytacError(f"{scene}: {error}") from error
         metrics |= {f"{key}.processor_ms_per_step": values["ms"], f"{key}.processor_ms_per_step_{name}": values["their_ms"]}
-        metrics |= {f"{key}.speedup_vs_{name}": values["speedup"]}
+        metrics |= {f"{key}.speedup_vs_{name}": values["speedup"], f"{key}.wall_speedup_vs_{name}": values["wall_speedup"]}
         metrics |= {f"{key}.speedup_least": values["least"], f"{key}.speedup_most": values["most"]}
         print(
-            f"{key}: {values['ms']:.1f} ms against {values['their_ms']:.1f} of {name}, {values['speedup']:.2f} times", flush=True
+            f"{key}: {values['ms']:.2f} ms against {values['their_ms']:.2f} of {name}, {values['speedup']:.2f} times, "
+            f"{values['wall_speedup']:.2f} by wall time",
+            flush=True,
         )
     return metrics
 
@@ -131,8 +141,8 @@ def commit(checkout: Path) -> str:
 
 
 def steps_of(scene: str) -> int:
-    """Steps of a round."""
-    return {"press": 20, "pad": 9, "frame": 40}[scene.partition(":")[0]]
+    """Steps of a round, of worlds turns."""
+    return {"press": 20, "pad": 9, "frame": 40, "push": 4, "ball": 10}[scene.partition(":")[0]]
 
 
 def press(size: str) -> Iterator[Callable[[], object]]:
@@ -192,19 +202,59 @@ def frame(name: str) -> Iterator[Callable[[], object]]:
         k += 1
 
 
+def push(name: str) -> Iterator[Callable[[], object]]:
+    """Control steps of ``bench_rl`` with policy; ``name``: observed, then the number of environments."""
+    from push_policy import MODES, Pusher
+
+    from raytac.envs import PushCubeVectorEnv
+
+    mode, _, envs = name.partition(":")
+    pusher = Pusher(PushCubeVectorEnv(int(envs), tactile=MODES[mode], seed=0, device="cpu"), 0)
+    while True:
+        yield pusher.step
+
+
+def ball(name: str) -> Iterator[Callable[[], object]]:
+    """Control steps of the checkout's own ``ball_rolling`` with image and markers; ``name``: pad."""
+    from experiments.ball_rolling import STROKES, Args, make_world
+    from experiments.rolling_control import RollingController
+
+    args = Args(device="cpu")
+    world = make_world(args, name)
+    sensor = world.sensor_names[0]
+    state, frame, controller = world.reset(), world.observe()[sensor], None
+
+    def step() -> None:
+        nonlocal state, frame, controller
+        if controller is None or controller.done:
+            state, frame = world.reset(), world.observe()[sensor]
+            goals = state.world_from_body["ball"][0, :2, 3] + 1e-3 * np.asarray(args.goals_mm)
+            controller = RollingController(world, 0, goals, STROKES[name])
+        force = max(-float(state.wrench[sensor][0, 2]), 0.0)
+        controller.update(state.world_from_pad[sensor][0], frame.surface.contact_centre[0], force)
+        state = world.step(controller)
+        frame = world.observe()[sensor]
+
+    while True:
+        yield step
+
+
 def main(scene: str) -> None:
     """Make a step for every line of the input."""
     kind, _, size = scene.partition(":")
-    first = {"press": 0, "pad": 2, "frame": 0}[
-        kind
-    ]  # steps of a round that are not counted: at rest, and before anything touches
-    for k, step in enumerate({"press": press, "pad": pad, "frame": frame}[kind](size)):
+    first = 2 if kind == "pad" else 0  # steps of a round that are not counted: at rest, and before anything touches
+    for k, step in enumerate({"press": press, "pad": pad, "frame": frame, "push": push, "ball": ball}[kind](size)):
         if not sys.stdin.readline():
             return
-        began = time.process_time()
-        step()
-        seconds = time.process_time() - began
-        print("seconds", seconds if k % steps_of(scene) >= first else "nan", flush=True)
+        count = TOGETHER.get(kind, 1)
+        began = time.process_time(), time.perf_counter()
+        for _ in range(count):
+            step()
+        ended = time.process_time(), time.perf_counter()
+        seconds = [
+            (end - begin) / count if k % steps_of(scene) >= first else np.nan for begin, end in zip(began, ended, strict=True)
+        ]
+        print("seconds", *seconds, flush=True)
 
 
 if __name__ == "__main__":

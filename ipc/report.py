@@ -18,15 +18,16 @@ class StepReport:
 
     Attributes:
         converged: Newton met its tolerance and the driven bodies reached their targets or are blocked.
-        failed: a number was not finite; the environment stays where the step began until its state is set again.
+        failed: a number was not finite; the environment stays where the step, or its last part, began until its state is set again.
         stalled: no step lowered the energy although the tolerance was not met.
+        halved: the step did not converge as a whole, and was made in halves, or quarters, which are told together.
         blocked: share of the commanded motion that could not be made, 0 if all of it was, 1 where the environment failed.
         min_gap: least distance between surfaces over all accepted states [m]; inf if none was below d̂.
         min_det: least det F over all accepted states [-].
         newton, linear, line_search, relags: iterations.
-        projected: the Hessian had to be made positive semi-definite.
+        projected: the Hessian had to be made positive semi-definite in some iteration.
         ccd: least share of a Newton step that continuous collision detection allowed.
-        speed: largest unknown's speed in the last Newton step [m/s], to compare with the tolerance.
+        speed: largest unknown's speed in the last Newton step [m/s], to compare with the tolerance; of parts, the largest.
         pairs: number of contact pairs at the end.
         kappa: barrier stiffness [Pa].
         elastic, kinetic, barrier: energies at the end [J].
@@ -35,6 +36,7 @@ class StepReport:
     converged: Flags
     failed: Flags
     stalled: Flags
+    halved: Flags
     blocked: Floats
     min_gap: Floats
     min_det: Floats

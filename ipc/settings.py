@@ -23,7 +23,9 @@ class Settings:
         dt: time step h [s].
         gravity: acceleration [m/s²], world frame.
         velocity_tolerance: Newton stops once no unknown would move faster than this [m/s]: ‖p‖_∞ ≤ velocity_tolerance · h.
-        max_newton: Newton iterations a step; reaching it is reported, and the state so far is kept.
+        max_newton: Newton iterations a step; reaching it is reported.
+        halvings: how often a step that has not converged is taken back and made anew in two halves; each half in turn. The report says so,
+            and its iterations count. 0: the state so far is kept.
         d_hat: distance below which surfaces repel [m]; None: 0.1 of the shortest edge on the deformable surfaces.
         kappa: barrier stiffness κ [Pa]; None: :func:`barrier_stiffness` of the bodies.
         friction: default coefficient μ [-] of every pair of bodies (``World`` takes exceptions by name).
@@ -58,6 +60,7 @@ class Settings:
     gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     velocity_tolerance: float = 1e-4
     max_newton: int = 100
+    halvings: int = 2
     d_hat: float | None = None
     kappa: float | None = None
     friction: float = 0.0
@@ -97,8 +100,9 @@ class Settings:
             raise IpcError(f"friction = {self.friction}: a coefficient cannot be negative")
         if not self.forcing >= 0:
             raise IpcError(f"forcing = {self.forcing}: a residual cannot be negative; 0 is that of linear_tolerance")
-        if self.friction_relags < 0:
-            raise IpcError(f"friction_relags = {self.friction_relags}: it cannot be negative")
+        for name in ("friction_relags", "halvings"):
+            if getattr(self, name) < 0:
+                raise IpcError(f"{name} = {getattr(self, name)}: it cannot be negative")
         if self.preconditioner not in ("auto", "block_jacobi", "rest_inverse"):
             raise IpcError(f"preconditioner = {self.preconditioner!r}: choose 'auto', 'block_jacobi' or 'rest_inverse'")
         if self.broad_phase not in ("auto", "lists", "bvh"):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import functools
 import os
 import shutil
 import tempfile
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from threading import RLock
 
@@ -21,10 +23,49 @@ tiles of a kernel. On CUDA threads share a device's stream, of which a recording
 """
 
 
+_levels: list[int] = []
+"""Levels of messages that were chosen, the last one holds; empty at first."""
+
+
+def choose_messages(*, quiet: bool) -> None:
+    """Let Warp print only warnings and errors, or also devices and every module that it loads."""
+    _levels.append(wp.LOG_WARNING if quiet else wp.LOG_INFO)
+    wp.config.log_level = _levels[-1]
+
+
 def start_warp() -> None:
-    """``wp.init()`` after ``use_writable_cache``."""
+    """``wp.init()`` after ``use_writable_cache``, without messages unless a level was chosen.
+
+    Chosen is what ``choose_messages`` was told, or any ``wp.config.log_level`` but Warp's own.
+    """
     use_writable_cache()
-    wp.init()
+    if not _levels and wp.config.log_level == wp.LOG_INFO:
+        choose_messages(quiet=True)
+    _init()
+
+
+@functools.cache
+def _init() -> None:
+    is_quiet = wp.config.log_level > wp.LOG_INFO and not _may_have_gpu()
+    with _no_standard_error() if is_quiet else contextlib.nullcontext():
+        wp.init()
+
+
+def _may_have_gpu() -> bool:
+    return any(Path("/dev").glob("nvidia[0-9]*")) or Path("/dev/dxg").exists()
+
+
+@contextlib.contextmanager
+def _no_standard_error() -> Iterator[None]:
+    """Drop native code's standard error: without a device, a missing driver is no news."""
+    original = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(original, 2)
+        os.close(original)
 
 
 @functools.cache

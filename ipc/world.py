@@ -165,10 +165,12 @@ class World:
             self._arrays.update()
             self.sums.expire()
         self._failed |= values["failed"].astype(bool)
+        self._expected &= values["halved"] == 0
         return StepReport(
             converged=values["converged"].astype(bool) | (~chosen & ~self._failed),
             failed=self._failed.copy(),
             stalled=values["stalled"].astype(bool),
+            halved=values["halved"],
             blocked=np.where(chosen | self._failed, 1.0 - values["progress"], 0.0),
             min_gap=values["min_gap"],
             min_det=values["min_det"],
@@ -176,7 +178,7 @@ class World:
             linear=values["linear"].astype(np.int64),
             line_search=values["line_search"].astype(np.int64),
             relags=np.maximum(values["relags"], 0).astype(np.int64),
-            projected=host(pot.project).astype(bool),
+            projected=values["projected"].astype(bool),
             ccd=values["ccd"],
             speed=values["speed"],
             pairs=host(pot.collision.contacts.count).astype(np.int64),

@@ -133,23 +133,26 @@ def check_numbers(name: str, values: object, shape: tuple[int | None, ...], *, f
 
     Refused are complex numbers, dates, text, objects, truth values, lists that are no box of numbers, and masked entries.
     """
-    wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"
     try:
         array = np.asarray(values)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(name, value=values, rule=f"must be numbers of shape {wanted}") from error
+        raise InputError(name, value=values, rule=f"must be numbers of shape {_shown(shape)}") from error
     if array.dtype.kind not in "iuf":
-        raise InputError(name, value=str(array.dtype), rule=f"must be real numbers of shape {wanted}")
+        raise InputError(name, value=str(array.dtype), rule=f"must be real numbers of shape {_shown(shape)}")
     if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
         if array.ndim == 0:
-            raise InputError(name, value=array.item(), rule=f"must have shape {wanted}, and is one number")
-        raise InputError(name, value=array.shape, rule=f"must have shape {wanted}")
+            raise InputError(name, value=array.item(), rule=f"must have shape {_shown(shape)}, and is one number")
+        raise InputError(name, value=array.shape, rule=f"must have shape {_shown(shape)}")
     if np.ma.is_masked(values):
         raise InputError(name, value=array.shape, rule="must have no masked entries")
     array = array.astype(float)
     if finite and not np.isfinite(array).all():
         raise InputError(name, value=float(array[~np.isfinite(array)][0]), rule="must be finite everywhere")
     return array
+
+
+def _shown(shape: tuple[int | None, ...]) -> str:
+    return "(" + ", ".join("any" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"
 
 
 def check_kind(name: str, value: object, kind: type[_T]) -> _T:

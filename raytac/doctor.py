@@ -86,7 +86,6 @@ print("matplotlib", matplotlib.__version__, "drew a figure; trimesh", trimesh.__
 _WARP = """
 import warp as wp
 from ipc import start_warp
-wp.config.log_level = wp.LOG_WARNING
 start_warp()
 print("Warp", wp.config.version, "on", ", ".join(str(device) for device in wp.get_devices()))
 """
@@ -192,7 +191,7 @@ def _no_denoiser() -> str:
 
 _VIEW = "import viser, websockets, msgspec; print('viser', viser.__version__)"
 _GPU = "import mujoco_warp; print('mujoco-warp imported')"
-_RL = "import gymnasium, mink; print('gymnasium', gymnasium.__version__)"
+_ENVS = "import gymnasium, mink; print('gymnasium', gymnasium.__version__)"
 
 PROBES = (
     Probe(
@@ -232,8 +231,8 @@ PROBES = (
         _absent("worlds on MuJoCo Warp, thousands on one GPU, need it", "mujoco_warp"),
     ),
     Probe(
-        "rl", _RL, False, "pip install 'raytac[rl]'",
-        _absent("raytac.envs and AddTactile need it", "gymnasium", "mink"),
+        "envs", _ENVS, False, "pip install 'raytac[envs]'",
+        _absent("raytac.envs, raytac play and AddTactile need it", "gymnasium", "mink"),
     ),
 )  # fmt: skip
 

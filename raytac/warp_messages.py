@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-from collections.abc import Iterator
 from pathlib import Path
 
-from raytac.device import cuda_device_count
 from raytac.installation import foreign_ipc
 
 
-def quiet_warp() -> None:
-    """Let Warp print only warnings and errors in this process.
+def quiet_warp(quiet: bool = True) -> None:
+    """Start Warp, and let it print only warnings and errors; or with False what it does.
 
-    Warp otherwise lists devices and every module that it loads. The level belongs to the process, so ``ipc`` and ``TactileSensor`` leave it
-    alone: this is for programs, such as the ``raytac`` command. Call it before contacts are first computed. Nothing happens without
-    raytac's own ``ipc``.
+    It then lists devices and every module that it loads. Without a call raytac is quiet from the first time that it computes, unless
+    ``warp.config.log_level`` was set before. The level belongs to the process. Nothing happens without raytac's own ``ipc``.
     """
     if foreign_ipc() is not None:
         return
-    import warp as wp
+    from ipc.warp_start import choose_messages, start_warp
 
-    from ipc import use_writable_cache
-
-    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    use_writable_cache()
-    with _no_standard_error() if cuda_device_count() == 0 else contextlib.nullcontext():
-        wp.init()
+    choose_messages(quiet=quiet)
+    start_warp()
 
 
 def has_compiled_kernels() -> bool:
@@ -37,16 +28,3 @@ def has_compiled_kernels() -> bool:
     import warp as wp
 
     return any(Path(wp.config.kernel_cache_dir or "").glob("wp_raytac*"))
-
-
-@contextlib.contextmanager
-def _no_standard_error() -> Iterator[None]:
-    """Drop native code's standard error: without a device, a missing driver is no news."""
-    original = os.dup(2)
-    try:
-        with open(os.devnull, "wb") as nowhere:
-            os.dup2(nowhere.fileno(), 2)
-        yield
-    finally:
-        os.dup2(original, 2)
-        os.close(original)

@@ -29,15 +29,16 @@ On the CPU Warp has one recording and one place for tiles a process, where threa
 
 
 def start_warp() -> None:
-    """``wp.init()``; kernels go to a temporary folder where the user's cannot be written.
+    """Start Warp as ``ipc`` does: quietly, and with a cache of kernels that can be written.
 
-    Where another package hides ``ipc``, Warp takes the user's folder as it is.
+    Where another package hides ``ipc``, Warp starts as it does by itself.
     """
     if foreign_ipc() is None:
-        from ipc import use_writable_cache
+        from ipc import start_warp as start
 
-        use_writable_cache()
-    wp.init()
+        start()
+    else:
+        wp.init()
 
 
 class Recorded:

@@ -31,8 +31,11 @@ sys.meta_path.insert(0, Without())
     [
         (("msgspec",), "from raytac.cli import main; sys.exit(main(['view', 'coin']))", VIEWER),
         (("msgspec",), "from raytac.view import Viewer", VIEWER),
-        (("gymnasium",), "from raytac.observe import AddTactile", "pip install 'raytac[rl]'"),
-        (("gymnasium",), "import raytac.envs", "pip install 'raytac[rl]'"),
+        (("gymnasium",), "from raytac.observe import AddTactile", "pip install 'raytac[envs]'"),
+        (("gymnasium",), "import raytac.envs", "pip install 'raytac[envs]'"),
+        (("gymnasium",), "from raytac.cli import main; sys.exit(main(['play', 'push_cube_ppo']))", "pip install 'raytac[envs]'"),
+        (("torch",), "from raytac.cli import main; sys.exit(main(['train']))", "train_policies needs PyTorch, which is not installed: pip"),
+        (("rsl_rl",), "from raytac.learn import Training", "Training needs "),
         (("torch",), "from raytac.envs import WarpBatch", "WarpBatch needs PyTorch, which is not installed: pip install 'raytac[rl]'"),
         (("h5py",), "from raytac.dataset import write_hdf5; write_hdf5('new.h5', [])", "pip install 'raytac[export]'"),
         (("zarr",), "from raytac.dataset import write_zarr; write_zarr('new.zarr', [])", "pip install 'raytac[export]'"),

@@ -40,6 +40,8 @@ def test_wheel_holds_both_packages_and_the_data(wheel: Path) -> None:
     for kind in ("scenes", "lights"):
         files = {path.relative_to(ROOT).as_posix() for path in (ROOT / kind).rglob("*") if path.is_file()}
         assert files and {f"raytac/_assets/{name}" for name in files} <= names
+    policies = {f"raytac/learn/policies/{path.name}" for path in (ROOT / "raytac" / "learn" / "policies").glob("*.pt")}
+    assert len(policies) >= 4 and policies <= names
     assert "ipc/__init__.py" in names and any(name.endswith("entry_points.txt") for name in names)
 
 

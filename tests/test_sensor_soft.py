@@ -139,7 +139,7 @@ def test_a_contact_of_few_cells_is_warned_of_once_a_press():
     assert 1.0 < frames[3].contact_cells[0] < 3.0
     assert len(told) == 1
     width = f"{frames[3].contact_cells[0]:.1f} cells across"
-    assert all(word in told[0] for word in ("level = 'coarse'", width, "at least 6", "choose level='fine'"))
+    assert all(word in told[0] for word in ("level = 'coarse'", width, "at least 6", "choose level='medium'"))
 
 
 def test_neither_a_wide_contact_nor_a_given_force_nor_an_image_is_warned_of():

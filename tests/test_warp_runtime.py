@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 
 import pytest
@@ -20,10 +21,36 @@ def test_warp_starts_where_another_package_hides_ours(monkeypatch: pytest.Monkey
 
 
 def test_a_cache_that_can_be_written_is_made_sure_of_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    import ipc
+    from ipc import warp_start
 
     calls: list[str] = []
-    monkeypatch.setattr(ipc, "use_writable_cache", lambda: calls.append("cache"), raising=False)
-    monkeypatch.setattr(wp, "init", lambda: calls.append("init"))
+    monkeypatch.setattr(warp_start, "use_writable_cache", lambda: calls.append("cache"))
+    monkeypatch.setattr(warp_start, "_init", lambda: calls.append("init"))
     warp_runtime.start_warp()
     assert calls == ["cache", "init"]
+
+
+_PRINTED = """
+import warp as wp
+import raytac
+{before}
+sensor = raytac.TactileSensor("gelsight_mini", outputs=("height",), device="cpu")
+sensor.press("sphere")
+print("level", wp.config.log_level)
+"""
+
+
+@pytest.mark.parametrize(
+    ("before", "level", "lists"),
+    [
+        ("", wp.LOG_WARNING, False),
+        ("raytac.quiet_warp(False)", wp.LOG_INFO, True),
+        ("raytac.quiet_warp()", wp.LOG_WARNING, False),
+        ("wp.config.log_level = wp.LOG_ERROR", wp.LOG_ERROR, False),
+        ("wp.config.log_level = wp.LOG_DEBUG", wp.LOG_DEBUG, True),
+    ],
+)
+def test_warp_is_quiet_unless_asked(before: str, level: int, lists: bool) -> None:
+    run = subprocess.run([sys.executable, "-c", _PRINTED.format(before=before)], capture_output=True, text=True, check=True)
+    assert f"level {level}" in run.stdout and ("load on device" in run.stdout + run.stderr) == lists
+    assert ("Warp" in run.stdout + run.stderr) == lists

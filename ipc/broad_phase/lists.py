@@ -73,9 +73,11 @@ def gap_bounds(candidates: Candidates, ee: wp.bool, env: wp.int32, i: wp.int32):
 
     With room for rounding.
     """
-    gap, moved = candidates.pt_gap[env, i] + wp.float64(0.0), wp.float64(2.0 + 1.0e-8) * candidates.moved[env]
-    if ee:
+    gap, moved = wp.float64(0.0), wp.float64(2.0 + 1.0e-8) * candidates.moved[env]
+    if ee:  # a conditional expression would read both lists, of which one may be shorter
         gap = candidates.ee_gap[env, i] + wp.float64(0.0)
+    if not ee:
+        gap = candidates.pt_gap[env, i] + wp.float64(0.0)
     return wp.float64(1.0 - 1.0e-9) * gap - moved, wp.float64(1.0 + 1.0e-9) * gap + moved
 
 

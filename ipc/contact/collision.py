@@ -153,7 +153,13 @@ class Collision:
     def _size_contacts(self, pairs: int, rows: int) -> None:
         place = {"verts": wp.vec4i, "coef": wp.vec4d, "normal": wp.vec3d, "pair": wp.int32}
         self._resize(self.contacts, place | {"force": wp.float64, "gap": wp.float64}, pairs)
-        fields = {"row_verts": wp.vec4i, "row": contacts.mat34d, "row_nodes": wp.vec4i, "node_row": contacts.mat34d}
+        fields = {
+            "row_verts": wp.vec4i,
+            "concave": wp.int32,
+            "row": contacts.mat34d,
+            "row_nodes": wp.vec4i,
+            "node_row": contacts.mat34d,
+        }
         self._resize(self.contacts, fields, rows)
         room = pairs if self.friction else 1
         for lagged in (self.lagged, self._old):  # contacts, and as many that have gone

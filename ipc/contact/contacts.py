@@ -19,6 +19,7 @@ class mat34d(wp.types.matrix(shape=(3, 4), dtype=wp.float64)):
 class Contacts:
     """Pairs within d̂ and the rows of their Hessian; a vertex of −1 is unused.
 
+    ``concave``: 1 where q qᵀ of a row is subtracted, unless the matrix must be definite.
     ``node_row``, ``row_nodes``: work space for the same rows over unknowns.
     """
 
@@ -32,6 +33,7 @@ class Contacts:
     row_verts: wp.array2d(dtype=wp.vec4i)
     row: wp.array2d(dtype=mat34d)
     row_count: IntArray
+    concave: IntArray2d
     row_nodes: wp.array2d(dtype=wp.vec4i)
     node_row: wp.array2d(dtype=mat34d)
 
@@ -43,16 +45,18 @@ def rows_of(contacts: Contacts, env: wp.int32) -> wp.int32:
 
 
 @wp.func
-def push_matrix(out: Contacts, env: wp.int32, verts: wp.vec4i, row: mat34d):
+def push_matrix(out: Contacts, env: wp.int32, verts: wp.vec4i, row: mat34d, concave: wp.int32):
+    """Add a row; a ``concave`` one (1) is subtracted."""
     slot = wp.atomic_add(out.row_count, env, 1)
     if slot < out.row.shape[1]:
         out.row_verts[env, slot] = verts
         out.row[env, slot] = row
+        out.concave[env, slot] = concave
 
 
 @wp.func
 def push_row(out: Contacts, env: wp.int32, verts: wp.vec4i, q0: wp.vec3d, q1: wp.vec3d, q2: wp.vec3d, q3: wp.vec3d):
-    push_matrix(out, env, verts, wp.matrix_from_cols(q0, q1, q2, q3))
+    push_matrix(out, env, verts, wp.matrix_from_cols(q0, q1, q2, q3), 0)
 
 
 @wp.func

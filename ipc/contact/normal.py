@@ -4,9 +4,16 @@ Weights follow ipctk's area weighting: A_v/4 for a point-triangle pair, (A_e + A
 with a third of the adjacent triangles' area for each vertex and edge. Surfaces that are flat over a d̂ carry a pressure near
 κ (−∂/∂d)[d̂ b/D̂²], whatever the mesh.
 
-The Hessian is a sum of *rows*, q qᵀ with q of four vertices: positive semi-definite by construction, and already the low-rank form
-that a Woodbury update needs. An unmollified pair gives one row, the Gauss-Newton term with k = max(0, 2b' + 4D b''); a mollified pair
-gives five: two for the 2×2 Hessian in (distance, c), clamped, and three for the curvature of c.
+The Hessian is a sum of *rows*, q qᵀ with q of four vertices: already the low-rank form that a Woodbury update needs. An unmollified
+pair gives one row, the Gauss-Newton term with k = max(0, 2b' + 4D b''), and two more for each unit tangent e along which its closest
+points are free to move. If the edge that is e by the vertices Σ h_i x_i turns, they slide, and the force F = −∂E/∂d has the curvature
+
+    F (2 τ ρ + d ρ²),     τ = e·Σ c_i δx_i,     ρ = n·Σ h_i δx_i,
+
+one positive and one negative eigenvalue. The negative one's row is *concave*: it is subtracted, and left out where the matrix must be
+definite. At a rim this curvature, of the order of F over an edge's length, is far above the gel's own. What is left out is F/d across
+an edge or a corner, which is negative. A mollified pair gives five rows: two for the 2×2 Hessian in (distance, c), clamped, and three
+for the curvature of c.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -144,13 +151,88 @@ def push_mollified(
             value = mean - radius
             px, py = -ey, ex
         if value > zero:
-            push_matrix(out, env, verts, wp.sqrt(value) * (px * e1 + py * e2))
+            push_matrix(out, env, verts, wp.sqrt(value) * (px * e1 + py * e2), 0)
     r = wp.sqrt(two * f * m1)
     for k in range(3):
         axis = wp.vec3d(zero, zero, zero)
         axis[k] = r
         ra, rb = wp.cross(v, axis), wp.cross(axis, u)
         push_row(out, env, verts, -ra, ra, -rb, rb)
+
+
+@wp.func
+def push_turn(
+    out: Contacts,
+    env: wp.int32,
+    verts: wp.vec4i,
+    coef: wp.vec4d,
+    n: wp.vec3d,
+    d: wp.float64,
+    force: wp.float64,
+    along: wp.vec3d,
+    turn: wp.vec4d,
+):
+    """Rows of force (2 τ ρ + d ρ²) for one unit tangent ``along``; ``turn`` are the h [1/m]."""
+    half, one = wp.float64(0.5), wp.float64(1.0)
+    # τ and ρ scaled to the same length are τ √g and ρ / √g; the form has the matrix [0 1; 1 ratio] in them, and eigenvectors (1, value).
+    g = wp.length(turn) / wp.length(coef)
+    ratio = d * g
+    root = wp.sqrt(ratio * ratio + wp.float64(4.0))
+    for k in range(2):
+        value = half * (ratio + root)
+        if k == 1:
+            value = half * (ratio - root)
+        size = wp.sqrt(force * wp.abs(value) / (one + value * value))
+        a, b = size * wp.sqrt(g), size * value / wp.sqrt(g)
+        row = wp.matrix_from_cols(
+            (a * coef[0]) * along + (b * turn[0]) * n,
+            (a * coef[1]) * along + (b * turn[1]) * n,
+            (a * coef[2]) * along + (b * turn[2]) * n,
+            (a * coef[3]) * along + (b * turn[3]) * n,
+        )
+        push_matrix(out, env, verts, row, k)
+
+
+@wp.func
+def push_turns(
+    out: Contacts,
+    env: wp.int32,
+    ee: wp.bool,
+    verts: wp.vec4i,
+    coef: wp.vec4d,
+    t: wp.vec3d,
+    force: wp.float64,
+    x0: wp.vec3d,
+    x1: wp.vec3d,
+    x2: wp.vec3d,
+    x3: wp.vec3d,
+):
+    """Rows of a pair that turns, for each edge along which its closest points may move."""
+    zero, one = wp.float64(0.0), wp.float64(1.0)
+    e, f, h, j = wp.vec3d(), wp.vec3d(), wp.vec4d(), wp.vec4d()
+    if ee:
+        if coef[0] != zero and coef[1] != zero:
+            e, h = x1 - x0, wp.vec4d(-one, one, zero, zero)
+        if coef[2] != zero and coef[3] != zero:
+            f, j = x2 - x3, wp.vec4d(zero, zero, one, -one)
+    else:
+        if coef[1] != zero and coef[2] != zero:
+            e, h = x1 - x2, wp.vec4d(zero, one, -one, zero)
+        if coef[1] != zero and coef[3] != zero:
+            f, j = x1 - x3, wp.vec4d(zero, one, zero, -one)
+        if coef[1] == zero and coef[2] != zero and coef[3] != zero:
+            e, h = x2 - x3, wp.vec4d(zero, zero, one, -one)
+    d = wp.length(t)
+    n = t / d
+    length = wp.length(e)
+    if length > zero:
+        e, h = e / length, h / length
+        push_turn(out, env, verts, coef, n, d, force, e, h)
+    across = wp.dot(e, f)
+    f, j = f - across * e, j - across * h
+    length = wp.length(f)
+    if length > zero:
+        push_turn(out, env, verts, coef, n, d, force, f / length, j / length)
 
 
 @wp.kernel
@@ -192,6 +274,8 @@ def contact_pairs(
             c, eps = cross_squared(x0, x1, x2, x3), mollifier_threshold(surface, item[0], item[1])
         if c >= eps:
             push_simple(out, gradient, energy, env, verts, coef, t, D, Dh, scale, item[2])
+            force = -wp.float64(2.0) * scale * wp.sqrt(D) * barrier_first(D, Dh)
+            push_turns(out, env, ee, verts, coef, t, force, x0, x1, x2, x3)
         else:
             push_mollified(out, gradient, energy, env, verts, coef, t, D, Dh, scale, x1 - x0, x3 - x2, c, eps, item[2])
 

@@ -161,6 +161,8 @@ def couple_rows(e: Elimination, system: SystemView, contacts: Contacts, active: 
     if active[env] == 0:
         return
     for r in range(lane, rows_of(contacts, env), lanes):
+        if contacts.concave[env, r] != 0:
+            continue
         verts, row = contacts.row_verts[env, r], contacts.row[env, r]
         one = affine_first(system, verts, -1)
         if one >= 0:
@@ -325,7 +327,7 @@ class AffineElimination:
         self.batch, self.lanes, self.device = batch, lanes, device
         self.threads = THREADS if device.is_cuda else 1
         count = len(layout.node_rest)
-        nodes, soft = _affine_nodes(layout), _soft_nodes(layout)
+        nodes, soft = affine_nodes(layout), _soft_nodes(layout)
         place, soft_place = np.full(count, -1), np.full(count, -1)
         place[nodes], soft_place[soft] = np.arange(len(nodes)), np.arange(len(soft))
         numbers = {"node": nodes, "place": place, "soft_node": soft, "soft_place": soft_place}
@@ -360,7 +362,7 @@ class AffineElimination:
         wp.launch(eliminate, dim=(self.batch, self.threads), inputs=inputs, outputs=[z], device=self.device, block_dim=THREADS)
 
 
-def _affine_nodes(layout: Layout) -> np.ndarray:
+def affine_nodes(layout: Layout) -> np.ndarray:
     """Nodes of affine bodies, body by body."""
     return np.unique(layout.vert_nodes[layout.vert_count == 4])
 
@@ -373,5 +375,5 @@ def _soft_nodes(layout: Layout) -> np.ndarray:
 
 def fits(layout: Layout, batch: int) -> bool:
     """True if the world has affine bodies, and S and C of all environments fit into memory."""
-    a, s = len(_affine_nodes(layout)), len(_soft_nodes(layout))
+    a, s = len(affine_nodes(layout)), len(_soft_nodes(layout))
     return 0 < batch * a * (a + s) * _BLOCK_BYTES <= MOST_BYTES

@@ -39,6 +39,8 @@ def diagonal_rows(system: SystemView, contacts: Contacts, spread: wp.bool, activ
     if active[env] == 0:
         return
     for r in range(lane, rows_of(contacts, env), lanes):
+        if contacts.concave[env, r] != 0:
+            continue
         verts, row = contacts.row_verts[env, r], contacts.row[env, r]
         share = wp.float64(0.0)
         if spread:

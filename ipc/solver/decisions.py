@@ -47,6 +47,7 @@ def start_step(friction: wp.int32, d: Decisions, f: Flags):
     d.linear[env] = 0
     d.line_search[env] = 0
     d.project[env] = 0
+    d.projected[env] = 0
     d.speed[env] = zero
     d.last[env] = zero
     d.ccd[env] = wp.float64(1.0)
@@ -146,6 +147,7 @@ def after_solve(iterations: IntArray, negative: IntArray, mask: IntArray, d: Dec
         d.pcg_iterations[env] = d.pcg_iterations[env] + iterations[env]
         if negative[env] != 0 and d.project[env] == 0:
             d.project[env] = 1
+            d.projected[env] = 1
             again = 1
             f.again[0] = 1
     d.again[env] = again
@@ -348,6 +350,9 @@ def conclude(
                 d.stalled[env] = 1
                 d.active[env] = 0
             d.project[env] = 1
+            d.projected[env] = 1
+        else:
+            d.project[env] = 0
         # So small a step has converged, also where rounding of the energies kept it from being accepted.
         if slow and d.allowed[env] >= wp.float64(1.0):
             d.rested[env] = 1
@@ -368,10 +373,13 @@ def conclude(
 
 @wp.kernel
 def choose_good(d: Decisions, f: Flags):
-    """Returns environments that failed, and their frames, to the start of the step."""
+    """Returns environments that failed, or are to converge and have not, and their frames, to the start of the step."""
     env = wp.tid()
-    d.good[env] = d.alive[env] * (1 - d.failed[env])
+    lost = d.failed[env]
+    if d.alive[env] != 0 and d.converged[env] == 0 and d.keep[env] == 0:
+        lost = 1
+    d.good[env] = d.alive[env] * (1 - lost)
     d.converged[env] = d.converged[env] * d.good[env]
-    d.accepted[env] = d.failed[env]
-    if d.failed[env] != 0:
+    d.accepted[env] = lost
+    if lost != 0:
         d.progress[env] = wp.float64(0.0)

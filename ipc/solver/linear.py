@@ -1,4 +1,4 @@
-"""The Newton matrix H = blocks + Σ q qᵀ.
+"""The Newton matrix H = blocks ± Σ q qᵀ.
 
 It is a block matrix of one pattern, with rows of volume blocks and of contacts.
 
@@ -7,7 +7,7 @@ dimensions, counts are read on the device.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
-# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false, reportReturnType=false
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class SystemView:
-    """Arrays that a product with H reads; ``free`` is 1 on the unknowns.
+    """Arrays that a product with H reads.
+
+    ``free`` is 1 on the unknowns, ``project`` where H must be definite.
 
     Block s of row i lies at ``row_base[i] + s·stride``: rows are dealt out in slices of ``stride``, so that threads of neighbouring rows
     read neighbouring blocks (Monakov et al. 2010, sliced ELLPACK); with a stride of 1 the rows lie one after the other.
@@ -41,6 +43,7 @@ class SystemView:
     col: IntArray
     diagonal: IntArray
     free: IntArray
+    project: IntArray
     verts: VertexMap
     blocks: MatArray2d
     R: MatArray2d
@@ -156,12 +159,21 @@ def spread_row(system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, 
 
 
 @wp.func
+def row_weight(system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32) -> wp.float64:
+    """1, or of a concave row −1; 0 where the matrix must be definite."""
+    if contacts.concave[env, r] != 0:
+        return wp.float64(system.project[env] - 1)
+    return wp.float64(1.0)
+
+
+@wp.func
 def add_row(system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32, p: VecArray2d, out: VecArray2d) -> wp.float64:
-    """out += q (q·p) of row r, on the unknowns; returns (q·p)²."""
+    """out += w q (q·p) of row r, on the unknowns; returns w (q·p)², w being its weight."""
     verts, row = contacts.row_verts[env, r], contacts.row[env, r]
+    w = row_weight(system, contacts, env, r)
     s = row_motion(system, verts, row, env, p)
-    spread_row(system, verts, row, env, s, out)
-    return s * s
+    spread_row(system, verts, row, env, w * s, out)
+    return w * s * s
 
 
 SPREAD = wp.constant(-2)
@@ -203,10 +215,11 @@ def add_turned_row(
     for k in range(4):
         if nodes[k] >= 0:
             s += wp.dot(row_column(row, k), p[env, nodes[k]])
+    w = row_weight(system, contacts, env, r)
     for k in range(4):
         if nodes[k] >= 0:
-            wp.atomic_add(out, env, nodes[k], s * row_column(row, k))
-    return s * s
+            wp.atomic_add(out, env, nodes[k], (w * s) * row_column(row, k))
+    return w * s * s
 
 
 @wp.kernel
@@ -246,7 +259,7 @@ def push_rows(system: SystemView, contacts: Contacts, dx: VecArray2d, active: In
         for k in range(4):
             if verts[k] >= 0:
                 s += wp.dot(row_column(row, k), dx[env, verts[k]])
-        spread_row(system, verts, row, env, -s, residual)
+        spread_row(system, verts, row, env, -s * row_weight(system, contacts, env, r), residual)
 
 
 @wp.kernel

@@ -3,14 +3,17 @@
 A Newton iteration has four parts:
 (i) While driven frames have not arrived, their motion enters the right-hand side, so that the unknowns make room for them in the same step.
 Frames and unknowns then move together as far as gaps allow.
-(ii) H p = −g is solved by PCG, with the exact Hessian first, and with a positive semi-definite one once negative curvature is met
-(projection on demand, after Longva et al. 2023, "Pitfalls of Projection"). It is solved loosely, as in inexact Newton methods (Dembo,
-Eisenstat, Steihaug 1982), and to the linear tolerance only where p is so small that it may be the last.
+(ii) H p = −g is solved by PCG, with the exact Hessian first, and with a positive semi-definite one if negative curvature is met
+(projection on demand, after Longva et al. 2023, "Pitfalls of Projection"), in each iteration anew: the definite one alone creeps. It is
+solved loosely, as in inexact Newton methods (Dembo, Eisenstat, Steihaug 1982), and to the linear tolerance only where p is so small that
+it may be the last.
 (iii) Continuous collision detection limits the step.
 (iv) The step is halved until the energy falls enough and no tetrahedron is inverted.
 
 An environment is done when p is small and its frames have arrived, or are blocked. Its friction is then lagged again, as often as the
-settings say. Environments never wait on or change each other's arithmetic: every decision is a mask.
+settings say. If it does not get done, it returns to the start of the step, which is made anew in two halves, and these likewise: with
+Coulomb's friction a step may have no solution near, where a shorter one does. Environments never wait on or change each other's
+arithmetic: every decision is a mask.
 
 The loop itself is made of conditional nodes, so that a whole step is one graph launch without the host: on a CPU, Warp goes through what
 was recorded in C++. If a buffer was too small, the step halts before anything changes, the host lets the buffer grow, and the step goes
@@ -106,9 +109,62 @@ class Newton:
     # --- the step --------------------------------------------------------------------------------------------------------------
 
     def step(self, alive: NDArray[np.bool_]) -> dict[str, NDArray]:
-        """Advance the environments of ``alive`` (B,) by a step; returns decisions (B,) by name."""
+        """Advance the environments of ``alive`` (B,) by a step; returns decisions (B,) by name, and those ``halved``."""
+        most = self.settings.halvings
+        total = self._attempt(alive, keep=most == 0)
+        lost = _unconverged(total, alive) & (most > 0)
+        total["halved"] = lost
+        if lost.any():
+            self._halve(total, lost)
+        return total
+
+    def _halve(self, total: dict[str, NDArray], lost: NDArray[np.bool_]) -> None:
+        """Make the step of ``lost`` (B,) anew in halves, and its rest at once after a smallest part that does not converge."""
+        pot, most = self.potential, self.settings.halvings
+        start, goal = [wp.clone(a) for a in (pot.frame_q, pot.frame_p)], [wp.clone(a) for a in (pot.goal_q, pot.goal_p)]
+        dt, share = pot.dt.numpy().copy(), wp.zeros(self.batch, dtype=wp.float64, device=self.device)
+        done, undone = np.zeros(self.batch), np.zeros(self.batch)
+        fresh = {"min_gap": np.inf, "min_det": np.inf, "ccd": 1.0, "stalled": 0, "speed": 0.0, "converged": 1}
+        for name, none in fresh.items():
+            total[name][lost] = none
+
+        def advance(envs: NDArray[np.bool_], end: float, depth: int) -> None:
+            """To a share ``end`` of the motion and the time."""
+            envs = envs & (total["failed"] == 0) & (total["converged"] == 1) & (done < end)
+            if not envs.any():
+                return
+            part = np.where(envs, end - done, 1.0)
+            share.fill_(end)
+            pot.launch(frames.frames_at, pot.frame_q.shape, [*start, *goal, share], [pot.R1, pot.goal_p, pot.goal_q])
+            pot.dt.assign(part * dt)
+            values = self._attempt(envs, keep=depth == most)
+            for name in ("newton", "linear", "line_search", "relags"):
+                total[name][envs] += np.maximum(values[name][envs], 0)
+            again = _unconverged(values, envs) & (depth < most)
+            kept = envs & ~again
+            for name in ("min_gap", "min_det", "ccd", "converged"):
+                total[name][kept] = np.minimum(total[name][kept], values[name][kept])
+            for name in ("failed", "stalled", "projected", "speed"):
+                total[name][kept] = np.maximum(total[name][kept], values[name][kept])
+            undone[kept] = (1.0 - values["progress"][kept]) * (part + undone)[kept]
+            done[kept] = end
+            advance(again, end - 0.5 ** (depth + 1), depth + 1)
+            advance(again, end, depth + 1)
+
+        advance(lost, 0.5, 1)
+        advance(lost, 1.0, 1)
+        settled, total["converged"] = total["converged"], np.ones_like(total["converged"])
+        advance(lost, 1.0, most)
+        total["converged"] = np.minimum(total["converged"], settled)
+        total["progress"][lost] = 1.0 - undone[lost]
+        wp.copy(pot.goal_q, goal[0])
+        wp.copy(pot.goal_p, goal[1])
+        pot.dt.assign(dt)
+
+    def _attempt(self, alive: NDArray[np.bool_], keep: bool) -> dict[str, NDArray]:
+        """Advance the environments of ``alive`` (B,); unless they ``keep`` it, only by a step that converges."""
         since = time.perf_counter()
-        self.state.write_alive(alive)
+        self.state.write_alive(alive, keep)
         self._run(self._whole)
         values = self.state.read()
         for _ in range(64):
@@ -327,6 +383,10 @@ class Newton:
             wp.copy(pot.frame_q, pot.now_q)
             wp.copy(pot.frame_p, pot.t)
             pot.energies()
+
+
+def _unconverged(values: dict[str, NDArray], envs: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return envs & (values["converged"] == 0) & (values["failed"] == 0)
 
 
 def _is_held(layout: Layout) -> bool:

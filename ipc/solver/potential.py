@@ -124,6 +124,7 @@ class Potential:
         self.system.verts = self.verts
         self.system.blocks = matrices(len(columns))
         self.system.R = self.R
+        self.system.project = self.project
 
     def launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list | None = None) -> None:
         """Launch a kernel on the device of the batch."""

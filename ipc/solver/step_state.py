@@ -37,6 +37,7 @@ class Decisions:
     rested: IntArray  # its unknowns came to rest since the last advance
     ready: IntArray  # took a plain step since the last advance
     since_lag: IntArray  # iterations since friction was lagged
+    keep: IntArray  # keeps the state that it has come to, also if it has not converged
     good: IntArray  # ends the step with a new state
     failed: IntArray
     converged: IntArray
@@ -45,7 +46,8 @@ class Decisions:
     linear: IntArray
     line_search: IntArray
     relags: IntArray  # −1 before friction was lagged for the first time
-    project: IntArray  # its Hessian is made definite
+    project: IntArray  # its Hessian is made definite in this Newton iteration
+    projected: IntArray  # it was in any
     progress: FloatArray  # share of the frames' motion that is done
     trial_progress: FloatArray  # where the advance that is tried would end
     length: FloatArray  # of an advance, as a share of what remains
@@ -99,7 +101,7 @@ class StepState:
     """
 
     def __init__(self, batch: int, project: wp.array, last: wp.array, halt: wp.array, device: wp.Device) -> None:
-        self.batch, self.device = batch, device
+        self.batch, self.device, self._keep = batch, device, False
         self.decisions, self.flags = Decisions(), Flags()
         self._arrays: list[tuple[list[str], wp.array]] = []
         for dtype in (wp.int32, wp.float64):
@@ -129,6 +131,9 @@ class StepState:
         """All decisions on the host, by name, each (B,); waits for the device."""
         return {name: row.copy() for names, rows in self._arrays for name, row in zip(names, rows.numpy(), strict=True)}
 
-    def write_alive(self, alive: NDArray[np.bool_]) -> None:
-        """Say which environments (B,) take part in the next step."""
+    def write_alive(self, alive: NDArray[np.bool_], keep: bool) -> None:
+        """Say which environments (B,) take part in the next step, and whether they ``keep`` its state if it does not converge."""
         self.decisions.alive.assign(alive.astype(np.int32))
+        if keep != self._keep:
+            self._keep = keep
+            self.decisions.keep.fill_(int(keep))

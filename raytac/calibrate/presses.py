@@ -1,5 +1,7 @@
-"""Real images of ball presses, read from three published layouts.
+"""Real images of ball presses: a folder of photographs, or one of three published layouts.
 
+- a folder with ``background.png`` and a PNG a press, of any names, all of one ball. Circles are searched for; those of a ``circles.csv``
+  (columns ``press``, the file's name without its end, ``cx_px``, ``cy_px``, ``r_px``) are taken instead, as ``raytac calibrate`` writes it.
 - ``labels.csv`` (columns ``diameter``, ``index``, ``cx_px``, ``cy_px``, ``r_px``, and perhaps ``edge_score``, ``fully_visible``) beside
   ``background.png`` and ``DIAMETER_INDEX.png``, such as ``6.310mm_07.png``.
 - ``catalog.csv`` (columns ``experiment_reldir``, ``diameter(mm)``) beside ``background.png`` and one folder a press, such as
@@ -24,8 +26,8 @@ from raytac.errors import CalibrationError, InputError
 from raytac.io.images import read_png
 from raytac.optics.taxim.restricted_pickle import npz_arrays
 
-LAYOUTS = ("labels.csv", "catalog.csv", "dataPack.npz")
-"""The file that tells a layout."""
+LAYOUTS = ("labels.csv", "catalog.csv", "dataPack.npz", "background.png")
+"""The file that tells a layout; where several are there, the first counts."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,8 @@ def read_presses(data: Path | str, *, ball_diameter: float | None = None) -> Rea
     """All presses of a data set, those at the border included.
 
     Args:
-        data: a folder of one of the three layouts, or a ``dataPack.npz``.
-        ball_diameter: [m]; needed by a ``dataPack.npz``, which does not say it, and refused elsewhere.
+        data: a folder of one of the layouts, or a ``dataPack.npz``.
+        ball_diameter: [m]; needed by plain photographs and a ``dataPack.npz``, which do not say it, and refused elsewhere.
 
     Raises:
         InputError: no such folder, none of the layouts, or a ball diameter where it is not needed, missing or not positive.
@@ -94,15 +96,19 @@ def read_presses(data: Path | str, *, ball_diameter: float | None = None) -> Rea
         raise InputError("data", value=str(data), rule="must exist")
     if ball_diameter is not None and not (math.isfinite(ball_diameter) and ball_diameter > 0):
         raise InputError("ball_diameter", value=ball_diameter, rule="must be a length > 0 [m]")
+    is_plain = False
     if data.is_dir():
         matching = [name for name in LAYOUTS if (data / name).exists()]
         if not matching:
             raise InputError("data", value=str(data), rule="must hold one of the files that tell a layout", choices=LAYOUTS)
-        data = data / matching[0]
-    if data.name.endswith(".npz"):
+        data, is_plain = data / matching[0], matching[0] == LAYOUTS[-1]
+    if data.name.endswith(".npz") or is_plain:
         if ball_diameter is None:
-            raise InputError("ball_diameter", rule=f"must be given: {data.name} does not say how large the ball is")
-        presses = _read_pack(data, ball_diameter / 2)
+            what = f"{data.parent} has photographs alone and" if is_plain else data.name
+            raise InputError(
+                "ball_diameter", rule=f"must be given (--ball-diameter-mm): {what} does not say how large the ball is"
+            )
+        presses = (_read_photographs if is_plain else _read_pack)(data, ball_diameter / 2)
     elif ball_diameter is not None:
         raise InputError("ball_diameter", value=ball_diameter, rule=f"must not be given: {data.name} says it for every press")
     elif data.name == "labels.csv":
@@ -138,6 +144,22 @@ def _read_catalog(path: Path) -> RealPresses:
         files.append(path.parent / row["experiment_reldir"] / "gelsight.png")
         radii.append(_number(path, number, "diameter(mm)", row["diameter(mm)"], positive=True) / 2e3)
     return _from_files(path.parent, files, radii, np.full((len(files), 3), np.nan))
+
+
+def _read_photographs(background: Path, ball_radius: float) -> RealPresses:
+    folder = background.parent
+    files = sorted(path for path in folder.glob("*.png") if path.name != background.name)
+    circles = {path.stem: [math.nan] * 3 for path in files}
+    table = folder / "circles.csv"
+    if table.exists():
+        for number, row in enumerate(_rows(table, ("press", "cx_px", "cy_px", "r_px")), start=2):
+            name = row["press"]
+            if name not in circles:
+                rule = "must be a photograph's name without .png"
+                raise CalibrationError(rule, file=table, key=f"line {number}, press", value=name, choices=list(circles))
+            centre = [_number(table, number, key, row[key]) for key in ("cx_px", "cy_px")]
+            circles[name] = [*centre, _number(table, number, "r_px", row["r_px"], positive=True)]
+    return _from_files(folder, files, [ball_radius] * len(files), np.array(list(circles.values())).reshape(-1, 3))
 
 
 def _read_pack(path: Path, ball_radius: float) -> RealPresses:

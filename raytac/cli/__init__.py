@@ -23,6 +23,9 @@ COMMANDS = {
     "view": ("ViewArgs", "a scene in the browser, with sliders that press or steer"),
     "dataset": ("DatasetArgs", "press objects many times: a data set of images and forces"),
     "compare": ("CompareArgs", "error of the image modes beside their time, as a report"),
+    "compare-physics": ("ComparePhysicsArgs", "the same presses on rigid and soft pads, as a report"),
+    "train": ("TrainArgs", "train a policy for a task by PPO, on the CPU or one GPU"),
+    "play": ("PlayArgs", "play a policy: a film with tactile images, and a success rate"),
     "bake": ("BakeArgs", "bake a Taxim table from the ray tracer of a sensor"),
     "calibrate": ("CalibrateArgs", "fit a sensor to photographs, or its markers to the soft pad"),
     "compare-real": ("CompareRealArgs", "fit to some photographs of presses and test on the others"),
@@ -96,7 +99,7 @@ def _run(args: Sequence[str]) -> int:
 def _overview(args: Sequence[str]) -> int:
     """One line a command; exits with code 2 unless help was asked for."""
     lines = ["usage: raytac COMMAND [OPTIONS]", "", "Simulate GelSight tactile sensors.", ""]
-    lines += [f"  {name:<14}{text}" for name, (_, text) in COMMANDS.items()]
+    lines += [f"  {name:<17}{text}" for name, (_, text) in COMMANDS.items()]
     lines += ["", "raytac COMMAND --help lists its options; raytac --version tells which raytac this is."]
     if args and args[0] in ("-h", "--help"):
         print("\n".join(lines))

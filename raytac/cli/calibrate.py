@@ -12,6 +12,7 @@ import tyro
 
 from raytac.cli.shared import FitOptions, SolverOptions, named, print_paths
 from raytac.errors import InputError
+from raytac.io.metrics import read_metrics
 from raytac.report.markers import run_calibrate_markers
 from raytac.specs import load_sensor
 from raytac.specs.press import PADS
@@ -42,8 +43,9 @@ class CalibrateArgs(FitOptions, SolverOptions):
     """Fit a sensor's optics to photographs of presses, or its marker motion to the soft pad.
 
     With a data set (docs/guide/calibrate.md), --model raytrace writes lights.toml and sensor.toml, --model taxim a calibration folder and
-    --model mlp mlp.npz, each beside circles.csv and metrics.json, which says data, split, errors and date. Every fifth press is held
-    out and scored. Without --out the folder is runs/calibrate/MODEL/SENSOR. An error or Ctrl-C leaves the folder as it was.
+    --model mlp mlp.npz, each beside fit.png (photograph, fit, error), circles.csv and metrics.json, which says data, split, errors and
+    date. Errors are printed. Every fifth press is held out and scored. Without --out the folder is runs/calibrate/MODEL/SENSOR. An error
+    or Ctrl-C leaves the folder as it was.
 
     With `markers`: press the soft pad, and fit FOTS and the force field to the displacement of its surface. Writes marker_motion.toml
     (which a sensor file names as marker_motion), errors.md, errors.png and arrows.png (marker models against surface tracking on presses
@@ -52,7 +54,7 @@ class CalibrateArgs(FitOptions, SolverOptions):
     """
 
     what: Annotated[str, tyro.conf.Positional]
-    """`markers`, or a folder of photographs or a dataPack.npz."""
+    """`markers`, or a folder of photographs with background.png, or a dataPack.npz."""
     model: Literal["raytrace", "taxim", "mlp"] = "raytrace"
     """Model to fit to a data set; table and network start with a fit of the lights, too."""
     holdout: int = 5
@@ -96,7 +98,7 @@ class CalibrateArgs(FitOptions, SolverOptions):
                 raise InputError(default.name, value=value, rule=rule)
 
     def _optics(self, start: float) -> int:
-        from raytac.report.real_calibration import run_calibrate_optics
+        from raytac.report.real_calibration import calibration_table, run_calibrate_optics
 
         sensor, presses, shots = self.read(Path(self.what), self.sensor)
         written = run_calibrate_optics(
@@ -117,4 +119,5 @@ class CalibrateArgs(FitOptions, SolverOptions):
             seed=self.seed,
             start=start,
         )
+        print(calibration_table(read_metrics(next(path for path in written if path.name == "metrics.json"))))
         return print_paths(written)

@@ -10,8 +10,19 @@ from typing import Annotated
 
 import tyro
 
-from raytac.cli.shared import SolverOptions, named
-from raytac.dataset import ENGINES, DatasetPlan, PressDataset, contact_sheet, render_dataset, verify_dataset
+from raytac.checks import check_number
+from raytac.cli.shared import SolverOptions, named, print_paths
+from raytac.dataset import (
+    ENGINES,
+    EXPORTS,
+    DatasetPlan,
+    PressDataset,
+    check_export,
+    contact_sheet,
+    export_presses,
+    render_dataset,
+    verify_dataset,
+)
 from raytac.errors import InputError
 from raytac.io.images import write_png
 from raytac.io.metrics import versions, write_metrics
@@ -58,6 +69,12 @@ class DatasetArgs(SolverOptions):
     """Deflate the arrays: smaller files, slower to read."""
     sheet: int = 0
     """Write sheet.png, a contact sheet of so many presses; 0 is none."""
+    export: Annotated[str | None, named(EXPORTS)] = None
+    """Also write the whole data set as LeRobot (videos alone), HDF5 or Zarr, beside its shards.
+
+    Needs raytac[export]."""
+    fps: float = 30.0
+    """With --export lerobot: frames a second at which a press is shown."""
     verify: bool = False
     """Render nothing: compare all files of the data set with their checksums."""
 
@@ -72,6 +89,9 @@ class DatasetArgs(SolverOptions):
             raise InputError("sheet", value=self.sheet, rule="must be a whole number >= 0")
         if self.sheet and not {"rgb", "height"} & set(plan.sweep.outputs):
             raise InputError("sheet", value=self.sheet, rule="shows images and heights: outputs must have 'rgb' or 'height'")
+        if self.export is not None:
+            check_export(self.export, out, plan.sweep)
+            check_number("fps", self.fps, "(0, inf)", "Hz")
         report = render_dataset(
             plan,
             out,
@@ -86,6 +106,7 @@ class DatasetArgs(SolverOptions):
         )
         if self.sheet:
             write_png(out / "sheet.png", contact_sheet(PressDataset(out), self.sheet))
+        exported = [] if self.export is None else export_presses(out, self.export, fps=self.fps, progress=True)
         metrics = {
             "command": "dataset",
             "sweep": plan.sweep.name,
@@ -104,7 +125,7 @@ class DatasetArgs(SolverOptions):
         }
         write_metrics(out / "metrics.json", metrics | {"wall_s": time.perf_counter() - start})
         print(f"{plan.sweep.count} presses, {report.failed} failed (manifest.parquet says why): {out}")
-        return 0
+        return print_paths(exported)
 
     def _verify(self, out: Path) -> int:
         """Compare the files with their checksums; ``InputError`` for a shard that is not whole."""

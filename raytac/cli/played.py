@@ -212,7 +212,7 @@ def scripted_session(task: str, *, shown: ObservationSettings, device: str, phys
 
 
 def policy_session(path: Path, *, shown: ObservationSettings, device: str, physics: Any) -> Session:
-    """Episodes of a task by a policy that ``train_gpu.py`` has written.
+    """Episodes of a task by a policy of ``raytac train``.
 
     One of ``train_ppo.py`` needs PyTorch: its task is shown, and the page says why nothing moves.
 
@@ -229,9 +229,8 @@ def policy_session(path: Path, *, shown: ObservationSettings, device: str, physi
 
         return WorldSession(batch.world, driver=EpisodeDriver(batch, begin, dict, missing), title=f"{task} · {path.name}")
     policy = envs.FlatPolicy(path)
-    felt = getattr(envs, policy.task).tactile if policy.touch == "task" else policy.tactile or ()
-    every = tuple(dict.fromkeys((*felt, *shown.modalities)))
-    hidden = [name for name in every if name not in felt]
+    every = tuple(dict.fromkeys((*policy.felt, *shown.modalities)))
+    hidden = [name for name in every if name not in policy.felt]
     wanted = ObservationSettings(every, resolution=shown.resolution, optics=shown.optics)
     vector = policy.vector(1, hidden=hidden, tactile=wanted, device=device, physics=physics or policy.physics)
     seen = vector.buffers
@@ -257,7 +256,7 @@ def _task_of_checkpoint(path: Path) -> str:
     try:
         task = str(saved["recipe"]["task"])
     except (KeyError, TypeError) as error:
-        raise InputError("policy", value=str(path), rule="must be a policy of train_gpu or train_ppo") from error
+        raise InputError("policy", value=str(path), rule="must be a policy of raytac train or train_ppo") from error
     return check_known("policy's task", task, tuple(envs.SCRIPTED))
 
 
@@ -268,4 +267,6 @@ def _has_torch() -> bool:
 def _why_not(path: Path) -> str:
     if not _has_torch():
         return f"{path.name} was trained by train_ppo: it needs PyTorch, which is not installed (pip install 'raytac[rl]')."
-    return f"{path.name} was trained by train_ppo, whose policies experiments/play.py plays; this page plays those of train_gpu."
+    return (
+        f"{path.name} was trained by train_ppo, whose policies experiments/play.py plays; this page plays those of raytac train."
+    )

@@ -109,7 +109,7 @@ class FitOptions(CommonOptions):
     """Options of a command that fits models to photographs."""
 
     ball_diameter_mm: float | None = None
-    """Needed by a dataPack.npz, which does not say it."""
+    """Diameter of the ball, of plain photographs and a dataPack.npz, which do not say it."""
     sides: str = FROM_SCRATCH
     """Numbers of red, green, blue LEDs at their walls, joined by commas; or `own`, the sensor's.
 
@@ -195,10 +195,9 @@ class SolverOptions(CommonOptions):
 
     def prepare_warp(self) -> None:
         """Call before contacts are first computed."""
-        if not self.verbose:
-            quiet_warp()
-            if not has_compiled_kernels():
-                logging.getLogger("raytac").info("compiling kernels: up to a minute, once on a machine")
+        quiet_warp(not self.verbose)
+        if not self.verbose and not has_compiled_kernels():
+            logging.getLogger("raytac").info("compiling kernels: up to a minute, once on a machine")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,8 +44,8 @@ class ViewArgs(ShadowOptions):
     scene: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Name of a shipped press or task, such as sphere or lift_cube, or path of a scene file.
 
-    A recording (.npz) that the page has saved, the folder of a data set, and a policy (.pt) are played. With --policy: a task's name, as
-    LiftCube."""
+    A recording (.npz) that the page has saved, the folder of a data set, and a policy (.pt, or a shipped one's name, as lift_cube_ppo) are
+    played. With --policy: a task's name, as LiftCube."""
     policy: Annotated[str | None, named(("scripted",))] = None
     """Policy that plays the task SCENE: scripted, which is written by hand."""
     sensor: str | None = None
@@ -93,8 +94,7 @@ class ViewArgs(ShadowOptions):
         if session is None:
             scene = load_scene(self.scene)
             physics = chosen_physics(self.physics, self.level, scene)
-            if not self.verbose:
-                quiet_warp()
+            quiet_warp(not self.verbose)
             session = self._press(scene, physics) if isinstance(scene, PressScene) else self._task(scene, physics)
             menu = self._menu(scene)
         serving = {"folder": self.out, "host": self.host, "port": self.port, "allow_hosts": allowed}
@@ -111,7 +111,7 @@ class ViewArgs(ShadowOptions):
 
     def _played(self) -> Session | None:
         """Session of a recording, a data set or a policy; None of a scene."""
-        path = Path(self.scene)
+        path = _shipped_policy(self.scene) or Path(self.scene)
         is_policy = self.policy is not None or path.suffix == ".pt"
         if not is_policy and path.suffix != ".npz" and not (path.is_dir() and (path / "dataset.json").exists()):
             return None
@@ -136,8 +136,7 @@ class ViewArgs(ShadowOptions):
             return dataset_session(path)
         if self.policy is not None:
             check_known("policy", self.policy, ("scripted",))
-        if not self.verbose:
-            quiet_warp()
+        quiet_warp(not self.verbose)
         resolution = (_LONGEST, _LONGEST * 3 // 4) if self.resolution is None else parse_resolution(self.resolution)
         optics = OPTICS.config(self.optics, **self.chosen_shadows())
         shown = ObservationSettings(("rgb", "markers", "wrench"), resolution=resolution, optics=optics)
@@ -199,3 +198,12 @@ def _fitting(resolution: tuple[int, int]) -> tuple[int, int]:
     scale = min(1.0, _LONGEST / max(resolution))
     width, height = (max(1, round(scale * side)) for side in resolution)
     return width, height
+
+
+def _shipped_policy(name: str) -> Path | None:
+    """File of a shipped policy; None for another name, or without the extra ``envs``."""
+    if importlib.util.find_spec("gymnasium") is None:
+        return None
+    from raytac.learn.policies import shipped_policies
+
+    return shipped_policies().get(name)

@@ -5,6 +5,9 @@ from .backgrounds import RandomBackground as RandomBackground
 from .episode import Episode as Episode
 from .episode import press_episodes as press_episodes
 from .episode import record_episode as record_episode
+from .exports import EXPORTS as EXPORTS
+from .exports import check_export as check_export
+from .exports import export_presses as export_presses
 from .exports import write_hdf5 as write_hdf5
 from .exports import write_zarr as write_zarr
 from .lerobot import write_lerobot as write_lerobot

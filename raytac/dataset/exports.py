@@ -5,18 +5,21 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from raytac.dataset.episode import Episode
+from raytac.checks import check_known
+from raytac.dataset.episode import Episode, press_episodes
 from raytac.dataset.loader import PressDataset
 from raytac.errors import BackendError, InputError
 from raytac.io.folder import new_path
 from raytac.io.progress import Progress
+from raytac.specs import SweepSpec
 
 _FORMAT = "raytac export"
 _CHUNK_BYTES, _BLOCK_BYTES = 1 << 20, 1 << 26
@@ -24,6 +27,61 @@ _CHUNK_BYTES, _BLOCK_BYTES = 1 << 20, 1 << 26
 _MAPS = {"height", "contact", "traction"}
 """Arrays on the pad's grid."""
 Source = PressDataset | Iterable[Episode]
+EXPORTS: Mapping[str, tuple[str, str]] = {
+    "lerobot": ("lerobot", "pyarrow"),
+    "hdf5": ("presses.h5", "h5py"),
+    "zarr": ("presses.zarr", "zarr"),
+}
+"""Formats of ``export_presses``: name beside the shards, and package that writes it."""
+
+
+def check_export(kind: str, folder: Path, sweep: SweepSpec) -> None:
+    """Raise what ``export_presses`` would after a sweep is rendered into ``folder``.
+
+    ``InputError``: an unknown format, a name that is taken, presses without a time axis for LeRobot. ``BackendError``: the writer's
+    package is not installed.
+    """
+    check_known("export", kind, tuple(EXPORTS))
+    name, package = EXPORTS[kind]
+    if importlib.util.find_spec(package) is None:
+        raise BackendError(f"export {kind!r} needs {package}, which is not installed: pip install 'raytac[export]'")
+    if kind == "lerobot" and sweep.frames_per_stage is None:
+        rule = "is of videos, and the sweep has one frame a press: give it frames_per_stage, or export hdf5 or zarr"
+        raise InputError("export", value=kind, rule=rule)
+    for path in _export_paths(folder, name, [sensor.name for sensor in sweep.sensors]).values():
+        if path.exists():
+            raise InputError("export", value=path, rule="must not exist: nothing is replaced; move it away")
+
+
+def export_presses(folder: str | Path, kind: str, *, fps: float = 30.0, progress: bool = False) -> list[Path]:
+    """Write a rendered data set in another format beside its shards, once a sensor.
+
+    Args:
+        folder: of the data set.
+        kind: ``lerobot`` (episodes, of videos alone), ``hdf5`` or ``zarr`` (arrays with the press first).
+        fps: of ``lerobot``: frames a second at which a press is shown.
+
+    Returns:
+        The paths: ``lerobot``, ``presses.h5`` or ``presses.zarr``; of several sensors with ``_SENSOR`` in their names.
+
+    Raises ``InputError`` and ``BackendError`` as ``write_lerobot``, ``write_hdf5`` and ``write_zarr``.
+    """
+    check_known("export", kind, tuple(EXPORTS))
+    from raytac.dataset.lerobot import write_lerobot
+
+    paths = _export_paths(Path(folder), EXPORTS[kind][0], tuple(PressDataset(folder, verify=False).description["sensors"]))
+    for sensor, path in paths.items():
+        data = PressDataset(folder, sensor=sensor)
+        if kind == "lerobot":
+            write_lerobot(path, press_episodes(data, fps=fps), progress=progress)
+        else:
+            (write_hdf5 if kind == "hdf5" else write_zarr)(path, data, progress=progress)
+    return list(paths.values())
+
+
+def _export_paths(folder: Path, name: str, sensors: Sequence[str]) -> dict[str, Path]:
+    stem, dot, suffix = name.partition(".")
+    return {sensor: folder / (name if len(sensors) == 1 else f"{stem}_{sensor}{dot}{suffix}") for sensor in sensors}
 
 
 def write_hdf5(path: str | Path, data: Source, *, compress: bool = True, progress: bool = False) -> Path:

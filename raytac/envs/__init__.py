@@ -7,11 +7,9 @@ from typing import Any
 
 import lazy_loader
 
-from raytac.envs.registration import register_envs
-from raytac.errors import BackendError
+from raytac.envs.registration import raise_absent, register_envs
 
 _attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-_LEARNERS = {"torch": "PyTorch", "tensordict": "tensordict", "rsl_rl": "rsl_rl", "stable_baselines3": "stable-baselines3"}
 
 
 def __getattr__(name: str) -> Any:
@@ -19,10 +17,7 @@ def __getattr__(name: str) -> Any:
     try:
         return _attribute(name)
     except ModuleNotFoundError as error:
-        package = (error.name or "").partition(".")[0]
-        if package not in _LEARNERS:
-            raise
-        raise BackendError(f"{name} needs {_LEARNERS[package]}, which is not installed: pip install 'raytac[rl]'") from error
+        raise_absent(name, error)
 
 
 register_envs()

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-from array_api_compat import array_namespace
-
-from raytac.envs.task_rules import Array, Motion, constant
+from raytac.envs.task_rules import Array, Motion, constant, namespace_of
 from raytac.se3 import rotations
 
 
@@ -28,7 +26,7 @@ class ToolTargets:
 
         ``opening``: commanded at the start of an episode [m].
         """
-        xp = array_namespace(tool)
+        xp = namespace_of(tool)
         self._motion, self._opening = motion, opening
         self.pose, self.turn = xp.asarray(tool, copy=True), xp.zeros_like(tool[:, :3, 3])
         self.gap = xp.full_like(tool[:, 0, 3], opening)
@@ -46,14 +44,14 @@ class ToolTargets:
 
     def begin(self, mask: Array, tool: Array) -> None:
         """Set the targets of the environments of a mask (B,) to poses (B, 4, 4)."""
-        xp = array_namespace(tool)
+        xp = namespace_of(tool)
         self.pose = xp.where(mask[:, None, None], tool, self.pose)
         self.turn = xp.where(mask[:, None], 0.0, self.turn)
         self.gap = xp.where(mask, self._opening, self.gap)
 
     def move(self, actions: Array, tool: Array) -> None:
         """Move the poses by actions (B, k), k the motion's axes; tools are at (B, 3) now."""
-        motion, xp = self._motion, array_namespace(actions)
+        motion, xp = self._motion, namespace_of(actions)
         pose = xp.asarray(self.pose, copy=True)
         shift = self._step * xp.stack([actions[:, k] for k in self._columns], axis=1)
         place = _leashed(pose[:, :3, 3] + shift, tool, self._leash)
@@ -85,12 +83,12 @@ def joint_targets(motion: Motion, actions: Array, target: Array, joints: Array, 
         target, joints: targets before and present positions (B, n) [rad].
         limits: lower and upper one of each joint (n, 2) [rad].
     """
-    xp = array_namespace(target)
+    xp = namespace_of(target)
     target = _leashed(target + motion.joint_step * actions, joints, motion.joint_leash)
     return xp.minimum(xp.maximum(target, limits[:, 0]), limits[:, 1])
 
 
 def _leashed(target: Array, now: Array, leash: Array | float) -> Array:
     """Targets that lead what is now by at most the leash."""
-    xp = array_namespace(target)
+    xp = namespace_of(target)
     return xp.minimum(xp.maximum(target, now - leash), now + leash)

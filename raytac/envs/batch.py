@@ -271,9 +271,9 @@ class TaskBatch:
 
     def _checked(self, actions: np.ndarray) -> np.ndarray:
         values = check_numbers("actions", actions, (self.num_envs, self.control.size))
-        wrong = ~np.isfinite(values) | (np.abs(values) > 1.0 + 1e-6)
-        if wrong.any():
-            env, axis = (int(i) for i in np.argwhere(wrong)[0])
+        right = np.abs(values) <= 1.0 + 1e-6  # not of NaN
+        if not right.all():
+            env, axis = (int(i) for i in np.argwhere(~right)[0])
             rule = f"must be finite and in [-1, 1]; in environment {env}, component {axis} is not"
             raise InputError("actions", value=float(values[env, axis]), rule=rule)
         if not self._begun.all():

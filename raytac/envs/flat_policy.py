@@ -1,4 +1,4 @@
-"""Policies that ``train_gpu.py`` has trained and saved by ``torch.save``, played by NumPy."""
+"""Policies of ``raytac train``, saved by ``torch.save`` and played by NumPy."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class FlatPolicy:
     It is rsl_rl's network in NumPy, so that a policy plays without PyTorch: normalised observations, then layers with ELU in between.
 
     Attributes:
-        task, touch, history, physics: what it was trained with, in the words of ``train_gpu.py``.
+        task, touch, history, physics: what it was trained with, in the words of ``raytac train``.
     """
 
     def __init__(self, path: Path) -> None:
@@ -43,11 +43,11 @@ class FlatPolicy:
             if [weight.shape for weight, _ in self._layers] != list(itertools.pairwise(sizes)):
                 raise ValueError("its layers do not fit each other")
         except Exception as error:
-            raise InputError("policy", value=path, rule=f"must be a policy of train_gpu ({error})") from error
+            raise InputError("policy", value=path, rule=f"must be a policy of raytac train ({error})") from error
 
     @staticmethod
     def is_one(path: Path) -> bool:
-        """True if the file says of itself that ``train_gpu.py`` has written it."""
+        """True if the file says of itself that ``raytac train`` has written it."""
         try:
             return "actor_state_dict" in read_tensors(path)
         except InputError:
@@ -57,6 +57,13 @@ class FlatPolicy:
     def tactile(self) -> Any:
         """Tactile observation, as ``TaskBatch`` takes it."""
         return {"none": None, "task": "task"}.get(self.touch, tuple(self.touch.split("+")))
+
+    @property
+    def felt(self) -> tuple[str, ...]:
+        """Modalities that it is given."""
+        import raytac.envs
+
+        return getattr(raytac.envs, self.task).tactile if self.touch == "task" else self.tactile or ()
 
     def vector(self, num_envs: int, *, hidden: Sequence[str] = (), **options: Any) -> FlatVector:
         """Environments of its task, observed as in training but for ``options``.

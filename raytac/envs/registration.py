@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NoReturn
 
 from raytac.errors import BackendError
 
 try:
     import gymnasium
 except ModuleNotFoundError as error:
-    raise BackendError("Gymnasium is not installed: pip install 'raytac[rl]'") from error
+    raise BackendError("Gymnasium is not installed: pip install 'raytac[envs]'") from error
+
+LEARNERS: Final = {"torch": "PyTorch", "tensordict": "tensordict", "rsl_rl": "rsl_rl", "stable_baselines3": "stable-baselines3"}
+"""Libraries of the extra ``rl`` by package."""
 
 _MODULES: Final = {
     "PushCube": "push_cube",
@@ -39,3 +42,11 @@ def register_envs() -> None:
             gymnasium.register(_NAMES[name], entry_point=f"{where}Env", vector_entry_point=f"{where}VectorEnv")
             vector = "raytac.envs:WarpVectorEnv"  # which names what is not installed
             gymnasium.register(_WARP_NAMES[name], vector_entry_point=vector, kwargs={"task": name})
+
+
+def raise_absent(name: str, error: ModuleNotFoundError) -> NoReturn:
+    """Raise ``BackendError`` if ``name`` lacks a learner's library, else ``error``."""
+    package = (error.name or "").partition(".")[0]
+    if package not in LEARNERS:
+        raise error
+    raise BackendError(f"{name} needs {LEARNERS[package]}, which is not installed: pip install 'raytac[rl]'") from error

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from array_api_compat import array_namespace
 
-from raytac.envs.task_rules import Array
+from raytac.envs.task_rules import Array, namespace_of
 from raytac.observe import ArraySpec, TactileObserver
 
 _LENGTH, _SPEED = 0.1, 1.0
@@ -27,7 +26,7 @@ def state_and_goal(
         action: last ones (B, k).
         goal: positions (B, 3) [m].
     """
-    xp, position = array_namespace(tool), tool[:, :3, 3]
+    xp, position = namespace_of(tool), tool[:, :3, 3]
     parts = [(position - start[:3, 3]) / _LENGTH, turn, speed / _SPEED, opening / _LENGTH, action]
     values = {"state": xp.concat(parts, axis=1), "goal": (goal - position) / _LENGTH}
     return {name: xp.astype(array, xp.float32) for name, array in values.items()}
@@ -35,7 +34,7 @@ def state_and_goal(
 
 def body_from_tool(tool: Array, body: Array, speed: Array) -> Array:
     """``body`` (B, 15): position from the tool, two columns of the rotation, velocities."""
-    xp = array_namespace(tool)
+    xp = namespace_of(tool)
     place = (body[:, :3, 3] - tool[:, :3, 3]) / _LENGTH
     return xp.astype(xp.concat([place, body[:, :3, 0], body[:, :3, 1], speed / _SPEED], axis=1), xp.float32)
 

@@ -8,10 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from array_api_compat import array_namespace
-
 from raytac.envs.task_observation import body_from_tool, state_and_goal
-from raytac.envs.task_rules import Array, Task, TaskState
+from raytac.envs.task_rules import Array, Task, TaskState, namespace_of
 from raytac.robots.pose_errors import PoseErrors
 
 
@@ -35,7 +33,7 @@ def task_outcome(task: Task, state: TaskState, steps: Array, max_episode_steps: 
         steps: since the start of each episode (B,); at ``max_episode_steps`` it is truncated.
         failed: environments (B,) whose physics broke down: truncated, with reward 0.
     """
-    xp, result = array_namespace(state.goal), task.evaluate(state)
+    xp, result = namespace_of(state.goal), task.evaluate(state)
     nothing = xp.zeros_like(state.goal[:, 0])
     terms = {name: xp.where(failed, 0.0, nothing + term) for name, term in result.terms.items()}
     terminated = result.terminated & ~failed
@@ -67,7 +65,7 @@ class TaskProgress:
             duration: of a step [s].
             errors: of 2 B poses.
         """
-        xp = array_namespace(tool)
+        xp = namespace_of(tool)
         self._task, self._duration, self._errors = task, duration, errors
         self.tool, self.body = (xp.asarray(poses, copy=True) for poses in (tool, body))
         self.start_tool, self.start_body = (xp.asarray(poses[0], copy=True) for poses in (tool, body))
@@ -77,7 +75,7 @@ class TaskProgress:
 
     def begin(self, mask: Array, tool: Array, body: Array, goal: Array) -> None:
         """Begin episodes in the environments of a mask (B,), at poses and goals of all (B, …)."""
-        xp, begun = array_namespace(tool), mask[:, None]
+        xp, begun = namespace_of(tool), mask[:, None]
         self.tool, self.body = (xp.where(begun[..., None], now, old) for now, old in ((tool, self.tool), (body, self.body)))
         self.goal = xp.where(begun, goal, self.goal)
         self._speed, self.body_speed, self.action = (

@@ -18,6 +18,15 @@ from raytac.se3 import rotations
 
 Array = Any
 """Array of NumPy or PyTorch."""
+_NAMESPACES: dict[type, Any] = {}
+
+
+def namespace_of(array: Array) -> Any:
+    """Functions of the array API for an array, looked up once for its type."""
+    kind = type(array)
+    if kind not in _NAMESPACES:
+        _NAMESPACES[kind] = array_namespace(array)
+    return _NAMESPACES[kind]
 
 
 @dataclass(frozen=True)
@@ -132,24 +141,24 @@ class Task(ABC):
 
 def distances(a: Array, b: Array) -> Array:
     """Distances (B,) of points (B, d), or from one point (d,)."""
-    xp, apart = array_namespace(a), a - b
+    xp, apart = namespace_of(a), a - b
     return xp.sqrt(xp.vecdot(apart, apart))
 
 
 def squared(vectors: Array) -> Array:
     """Squared lengths (B,) of vectors (B, d)."""
-    xp = array_namespace(vectors)
+    xp = namespace_of(vectors)
     return xp.sum(xp.square(vectors), axis=1)
 
 
 def near(distance: Array, width: float) -> Array:
     """1 − tanh(d / width): 1 at no distance, 0 far away."""
-    return 1.0 - array_namespace(distance).tanh(distance / width)
+    return 1.0 - namespace_of(distance).tanh(distance / width)
 
 
 def constant(values: Sequence[float], like: Array) -> Array:
     """Vector of another array's type, made on its device: nothing is copied from the host."""
-    result = array_namespace(like).empty((len(values),), dtype=like.dtype, device=device(like))
+    result = namespace_of(like).empty((len(values),), dtype=like.dtype, device=device(like))
     for k, value in enumerate(values):
         result[k : k + 1] = value  # a slice is filled on the device, a single element would be copied there
     return result
@@ -162,18 +171,18 @@ def between(u: Array, low: float, high: float) -> Array:
 
 def moved(point: Array, x: Array, y: Array) -> Array:
     """Points (n, 3): one point (3,), or points (n, 3), moved horizontally by x and y, each (n,)."""
-    xp = array_namespace(x)
+    xp = namespace_of(x)
     return point + xp.stack([x, y, xp.zeros_like(x)], axis=1)
 
 
 def around(points: Array, angle: Array, distance: Array) -> Array:
     """Points (n, 3) at a distance from ``points`` along a horizontal angle [rad], (n,)."""
-    xp = array_namespace(points)
+    xp = namespace_of(points)
     return moved(points, distance * xp.cos(angle), distance * xp.sin(angle))
 
 
 def turned(rotation: Array, angle: Array) -> Array:
     """Rotations (n, 3, 3): ``rotation`` (3, 3) turned about world z by angles (n,) [rad]."""
-    xp = array_namespace(angle)
+    xp = namespace_of(angle)
     zero = xp.zeros_like(angle)
     return rotations(xp.stack([zero, zero, angle], axis=1)) @ rotation

@@ -1,5 +1,8 @@
 from .arrays import npz_bytes as npz_bytes
 from .atomic import write_atomic as write_atomic
+from .films import check_mp4 as check_mp4
+from .films import gif_bytes as gif_bytes
+from .films import mp4_bytes as mp4_bytes
 from .folder import FolderLock as FolderLock
 from .folder import result_folder as result_folder
 from .images import read_png as read_png
@@ -13,6 +16,7 @@ from .metrics import write_metrics as write_metrics
 from .options import CommonOptions as CommonOptions
 from .options import parse_names as parse_names
 from .options import parse_resolution as parse_resolution
+from .options import parse_seeds as parse_seeds
 from .progress import Progress as Progress
 from .seal import SealError as SealError
 from .seal import read_sealed as read_sealed

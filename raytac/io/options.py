@@ -47,6 +47,15 @@ def parse_names(text: str, option: str, choices: tuple[str, ...] | None = None) 
     return names
 
 
+def parse_seeds(text: str) -> list[int]:
+    """Whole numbers joined by commas. Raises ``InputError`` for others."""
+    names = parse_names(text, "seeds")
+    for name in names:
+        if not name.isdecimal():
+            raise InputError("seeds", value=name, rule="must be whole numbers >= 0 joined by commas")
+    return [int(name) for name in names]
+
+
 def parse_outputs(text: str, choices: tuple[str, ...]) -> tuple[str, ...]:
     """Names joined by commas, in the order of ``choices``. Raises as ``parse_names``."""
     names = parse_names(text, "outputs", choices)

@@ -60,7 +60,7 @@ def gymnasium_space(specs: Mapping[str, ArraySpec]) -> gymnasium.spaces.Dict:
     try:
         from gymnasium import spaces
     except ImportError as error:
-        raise BackendError(f"spaces need Gymnasium ({error}): `pip install 'raytac[rl]'`") from error
+        raise BackendError(f"spaces need Gymnasium ({error}): `pip install 'raytac[envs]'`") from error
     return spaces.Dict({name: spaces.Box(spec.low, spec.high, spec.shape, spec.dtype) for name, spec in specs.items()})
 
 

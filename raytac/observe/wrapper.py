@@ -16,7 +16,7 @@ try:
     import gymnasium
     from gymnasium.vector import AutoresetMode
 except ModuleNotFoundError as error:
-    raise BackendError("Gymnasium is not installed: pip install 'raytac[rl]'") from error
+    raise BackendError("Gymnasium is not installed: pip install 'raytac[envs]'") from error
 
 Frames = Callable[..., Mapping[str, TactileFrame]]
 """Function that returns the present frame of each sensor, as ``TactileWorld.observe``.

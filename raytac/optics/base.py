@@ -146,6 +146,10 @@ class OpticsConfig(Generic[Mode]):
     def bake(self, spec: SensorSpec, device: str) -> None:
         """Do work before the first image that stays on disk; a comparison does not time it."""
 
+    def bake_renders(self, spec: SensorSpec) -> int:
+        """Images of the sensor's own size that ``bake`` would render; 0 if its work is there."""
+        return 0
+
     @classmethod
     def variants(cls) -> tuple[Variant, ...]:
         """Settings that ``raytac compare`` measures: the defaults, unless the mode says otherwise."""

@@ -13,6 +13,9 @@ from .measure import once as once
 from .measure import timed as timed
 from .measure import timed_within as timed_within
 from .measure import wilson_interval as wilson_interval
+from .pads import PadPress as PadPress
+from .pads import pad_metrics as pad_metrics
+from .pads import press_pads as press_pads
 from .press import press_peaks as press_peaks
 from .press import run_press as run_press
 from .preview import camera_extent_mm as camera_extent_mm

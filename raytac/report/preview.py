@@ -181,8 +181,13 @@ def _object_panel(axes: Axes, data: PreviewData) -> None:
     if data.contact.any() and not data.contact.all():
         x, y = 1e3 * data.grid.x, 1e3 * data.grid.y
         axes.contour(x, y, data.contact.astype(float), levels=[0.5], colors="#d55e00", linewidths=0.7)
-        label = axes.text(0.03, 0.04, "contact", color="#d55e00", fontsize=7, transform=axes.transAxes)
-        label.set_bbox({"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.0})
+        _note(axes, "contact", "#d55e00")
+
+
+def _note(axes: Axes, text: str, colour: str = "#222222") -> None:
+    """A word at the lower left inside of a map, where a title would run over the colour bar."""
+    label = axes.text(0.03, 0.04, text, color=colour, fontsize=7, transform=axes.transAxes)
+    label.set_bbox({"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.0})
 
 
 def _indentation_panel(axes: Axes, data: PreviewData) -> None:
@@ -210,7 +215,10 @@ def _marker_panel(axes: Axes, data: PreviewData) -> None:
 
 
 def _traction_axes(axes: Axes, data: PreviewData, kind: str, note: str = "") -> None:
-    _map_axes(axes, data, f"{kind} traction [kPa]" + (", rest place" if data.traction_at_rest else "") + note)
+    _map_axes(axes, data, f"{kind} traction [kPa]")
+    notes = [text for text in ("at the place of rest" if data.traction_at_rest else "", note) if text]
+    if notes:
+        _note(axes, ", ".join(notes))
 
 
 def _is_sheared(data: PreviewData) -> bool:
@@ -220,7 +228,7 @@ def _is_sheared(data: PreviewData) -> bool:
 
 def _pressure_panel(axes: Axes, data: PreviewData) -> None:
     assert data.traction is not None
-    _traction_axes(axes, data, "normal", "" if _is_sheared(data) else ", no shear")
+    _traction_axes(axes, data, "normal", "" if _is_sheared(data) else "no shear")
     pressure = -1e-3 * data.traction[..., 2]
     extent = _grid_extent_mm(data.grid)
     _colour_bar(axes, axes.imshow(pressure, extent=extent, cmap="magma", vmin=0.0, vmax=max(float(pressure.max()), 1e-3)))
@@ -272,7 +280,7 @@ def _normal_colours(normals: np.ndarray) -> np.ndarray:
 
 def _difference_panel(axes: Axes, data: PreviewData) -> None:
     assert data.rgb is not None and data.rest_rgb is not None
-    _map_axes(axes, data, f"image − rest (±{DIFFERENCE_RANGE} of 255)")
+    _map_axes(axes, data, f"image − rest, ±{DIFFERENCE_RANGE} of 255")
     axes.imshow(difference_to_rest(data.rgb, data.rest_rgb), extent=data.extent_mm, interpolation="nearest")
 
 

@@ -390,9 +390,14 @@ def draw(real: np.ndarray, images: list[dict[str, np.ndarray]], circles: list[np
     """Draw a row a press, cut to the contact: photograph, modes, signed errors (grey is none)."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
+    from matplotlib.patches import Circle
 
     modes = [(key, name) for key, name in _ROWS if key in images[0] and key not in (ALONE, "background")]
-    columns = ["photograph", *(name for _, name in modes), *(f"{name}, error × 4" for _, name in modes)]
+    columns = [
+        "photograph",
+        *(name for _, name in modes),
+        *(f"{name}, error × 4" if len(modes) > 1 else "error × 4" for _, name in modes),
+    ]
     with rc_context({"font.size": 6.5}):
         figure = Figure(figsize=(1.1 * len(columns), 1.12 * len(real)), layout="constrained")
         axes = figure.subplots(len(real), len(columns), squeeze=False)
@@ -403,6 +408,10 @@ def draw(real: np.ndarray, images: list[dict[str, np.ndarray]], circles: list[np
             for axis, image in zip(line, shown, strict=True):
                 axis.imshow(np.clip(image[box], 0, 255).astype(np.uint8))
                 axis.set(xticks=[], yticks=[])
+            circle = Circle(
+                (x - low_x - 0.5, y - low_y - 0.5), r, fill=False, color="white", linewidth=0.5, linestyle=(0, (4, 4))
+            )
+            line[0].add_patch(circle)
         for axis, name in zip(axes[0], columns, strict=True):
             axis.set_title(name)
         figure.savefig(path, dpi=110)

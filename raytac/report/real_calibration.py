@@ -6,6 +6,7 @@ import dataclasses
 import datetime
 import logging
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from raytac.optics.taxim.folder import CALIBRATION_FILES, save_calibration
 from raytac.optics.taxim.mode import TaximMode
 from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.tracer import Tracer
+from raytac.report.real import draw
 from raytac.report.real_drift import drift_metrics, drift_rows, grain_metrics
 from raytac.report.real_scores import outliers, press_scores, summary
 from raytac.specs import SensorSpec
@@ -37,6 +39,7 @@ FITTED = ("raytrace", "taxim", "mlp")
 """Models that photographs are fitted by; Phong's has nothing to fit."""
 FILES = (
     *CALIBRATION_FILES,
+    "fit.png",
     "mlp.npz",
     "lights.toml",
     "sensor.toml",
@@ -47,6 +50,8 @@ FILES = (
 )
 
 _LOG = logging.getLogger("raytac")
+_SHOWN = 4
+"""Presses in ``fit.png``."""
 
 
 def run_calibrate_optics(
@@ -142,7 +147,7 @@ def run_calibrate_optics(
         drifts = no_drift(len(index))
         for chosen, own in ((~is_test, models.settled.drift), (is_test, models.drift(test))):
             drifts.gain[chosen], drifts.offset[chosen] = own.gain, own.offset
-        fitted_errors = np.empty(0)
+        fitted_errors, shown = np.empty(0), None
         for name, one in models.modes.items():
             for part, chosen, some in (("fitted", ~is_test, train), ("held_out", is_test, test)):
                 if not chosen.any():
@@ -156,6 +161,8 @@ def run_calibrate_optics(
                         metrics |= {f"{prefix}.{measure}": value for measure, value in mean.items()}
                 if key == "fitted":
                     fitted_errors = np.array([score["contact_mae"] for score in scores])
+                if name == model:  # the held-out ones, where there are some
+                    shown = some, images, circles[chosen], np.array([score["contact_mae"] for score in scores])
         metrics |= {f"cost.round_{k}": cost for k, cost in enumerate(fitted.costs)}
         bad = outliers([names[k] for k in index[~is_test]], fitted_errors, fitted.state.circles, train)
         metrics["outliers"] = ", ".join(bad)
@@ -178,6 +185,8 @@ def run_calibrate_optics(
             save_calibration(mode.table, folder)
         elif isinstance(mode, MlpMode):
             save_mlp(mode.weights, folder / "mlp.npz")
+        assert shown is not None
+        _draw_fit(model, *shown, folder / "fit.png")
         rows = ["press,held_out,cx_px,cy_px,r_px"]
         rows += [f"{name},{int(h)},{x:.3f},{y:.3f},{r:.3f}" for name, h, (x, y, r) in zip(names, is_test, circles, strict=True)]
         (folder / "circles.csv").write_text("\n".join(rows) + "\n", "utf-8")
@@ -185,3 +194,25 @@ def run_calibrate_optics(
         write_metrics(folder / "metrics.json", metrics | {"wall_s": time.perf_counter() - start})
         written = sorted(path.name for path in folder.iterdir())
     return [out / name for name in written]
+
+
+def _draw_fit(model: str, shots: Photographs, images: np.ndarray, circles: np.ndarray, errors: np.ndarray, path: Path) -> None:
+    """Draw presses from the best to the worst: photograph with its circle, fit, error."""
+    order = np.argsort(errors)
+    chosen = order[np.unique(np.linspace(0, len(order) - 1, min(_SHOWN, len(order))).round().astype(int))]
+    draw(shots.presses[chosen], [{model: images[k]} for k in chosen], list(circles[chosen]), path)
+
+
+def calibration_table(metrics: Mapping[str, Metric]) -> str:
+    """Markdown of a fit's errors [levels of 255], from what ``run_calibrate_optics`` wrote."""
+    lines = ["| presses | contact MAE | ring MAE | whole image MAE | PSNR around the contact [dB] |", "|---|---|---|---|---|"]
+    for key, text in (
+        ("fitted", "fitted"),
+        ("held_out", "held out"),
+        ("border.fitted", "at the border, fitted"),
+        ("border.held_out", "at the border, held out"),
+    ):
+        if f"{key}.contact_mae" in metrics:
+            names = ("contact_mae", "ring_mae", "frame_mae", "box_psnr")
+            lines.append(f"| {text} | " + " | ".join(f"{metrics[f'{key}.{name}']:.2f}" for name in names) + " |")
+    return "\n".join(lines)

@@ -114,7 +114,7 @@ class CSoftPads(SoftPads):
         for b in alive:
             mujoco.mj_step2(models[b], datas[b])
         if alive:
-            failed[alive] = lost([datas[b] for b in alive])
+            failed[alive] = lost(*(np.array([getattr(datas[b], name) for b in alive]) for name in ("qvel", "qpos")))
         for b in np.flatnonzero(~failed).tolist():
             mujoco.mj_kinematics(models[b], datas[b])
             mujoco.mj_comPos(models[b], datas[b])

@@ -11,6 +11,7 @@ from raytac.gel.surface import PadGrid
 from raytac.physics.base import PadReading
 from raytac.physics.rigid.gel_contact import GelContact
 from raytac.se3 import inverse
+from raytac.warp_runtime import HostArrays
 from raytac.world.engine.base import Engine
 from raytac.world.gel_pairs import GelPairs
 from raytac.world.pad_surfaces import PadSurfaces
@@ -26,6 +27,7 @@ class RigidReadings:
     def __init__(self, composed: WorldModel, contact: GelContact, pairs: GelPairs, engine: Engine) -> None:
         """Readings of the pads of ``composed``; the others are as of ``RigidPads``."""
         self.composed, self.contact, self.engine = composed, contact, engine
+        self._wrenches = HostArrays(contact.wrenches)
         self.bodies = composed.touched
         self._names = [mounted.name for mounted in composed.sensors]
         gels, shapes = [spec.gelpad for spec in composed.sensor_specs], [body.parts for body in self.bodies]
@@ -44,7 +46,7 @@ class RigidReadings:
 
     def wrench(self, name: str) -> np.ndarray:
         """Wrench (B, 6) on a pad about its origin, pad frame, in the last step."""
-        return self.contact.wrenches.numpy()[:, self._names.index(name)].copy()
+        return self._wrenches.read()[0][:, self._names.index(name)].copy()
 
     def overlap(self, env: int) -> list[tuple[str, str, float]]:
         """Sensor, body and depth [m] of every overlap at present; inf beyond a pad's bonded face."""

@@ -82,8 +82,7 @@ def constant_controls(control: np.ndarray, num_envs: int, count: int) -> np.ndar
     return np.broadcast_to(values, (num_envs, count))
 
 
-def lost(datas: Sequence[mujoco.MjData]) -> np.ndarray:
-    """True (n,) for states of MuJoCo that are not finite or have a joint far too fast."""
-    speed, position = np.array([data.qvel for data in datas]), np.array([data.qpos for data in datas])
+def lost(speed: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """True (n,) where ``qvel`` or ``qpos`` (n, …) is not finite or a joint is far too fast."""
     # One number that is not finite makes the sum such.
     return np.logical_not((np.abs(speed).max(axis=1, initial=0.0) < LARGEST_SPEED) & np.isfinite(position.sum(axis=1)))

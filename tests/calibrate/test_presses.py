@@ -1,4 +1,4 @@
-"""Real presses are read from the three published layouts, or refused with file and rule."""
+"""Real presses are read from photographs and three published layouts, or refused with file and rule."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def test_what_is_no_data_set_is_refused(labelled: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="must exist"):
         read_presses(tmp_path / "none")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"labels\.csv, catalog\.csv, dataPack\.npz"):
+    with pytest.raises(InputError, match=r"labels\.csv, catalog\.csv, dataPack\.npz, background\.png"):
         read_presses(tmp_path / "empty")
     with pytest.raises(InputError, match="must not be given"):
         read_presses(labelled, ball_diameter=6e-3)
@@ -150,3 +150,28 @@ def test_circles_can_be_replaced(labelled: Path) -> None:
     moved = presses.with_circles(presses.circles + 1)
     np.testing.assert_allclose(moved.circles - presses.circles, 1)
     assert moved.images is presses.images
+
+
+def test_plain_photographs_have_names_of_their_own_and_circles_only_where_a_table_says_so(tmp_path: Path) -> None:
+    for k, name in enumerate(("background", "IMG 7", "a", "b")):
+        write_png(tmp_path / f"{name}.png", np.full((12, 16, 3), 40 * k, np.uint8))
+    with pytest.raises(InputError, match=r"ball-diameter-mm.*photographs alone"):
+        read_presses(tmp_path)
+    presses = read_presses(tmp_path, ball_diameter=4e-3)
+    assert presses.names == ("IMG 7", "a", "b") and np.isnan(presses.circles).all()
+    assert presses.images[:, 0, 0, 0].tolist() == [40, 80, 120] and (presses.ball_radius == 2e-3).all()
+    (tmp_path / "circles.csv").write_text("press,held_out,cx_px,cy_px,r_px\nb,0,5.5,6,3\n", "utf-8")
+    again = read_presses(tmp_path, ball_diameter=4e-3)
+    assert again.circles[2].tolist() == [5.5, 6.0, 3.0] and np.isnan(again.circles[:2]).all()
+    for text, said in (
+        ("c,0,5,6,3", "must be a photograph's name.*IMG 7"),
+        ("b,0,5,6,-3", "line 2, r_px"),
+        ("b,0,,6,3", "must not be empty"),
+    ):
+        (tmp_path / "circles.csv").write_text(f"press,held_out,cx_px,cy_px,r_px\n{text}\n", "utf-8")
+        with pytest.raises(CalibrationError, match=said):
+            read_presses(tmp_path, ball_diameter=4e-3)
+    (tmp_path / "circles.csv").unlink()
+    write_png(tmp_path / "c.png", np.zeros((12, 17, 3), np.uint8))
+    with pytest.raises(CalibrationError, match=r"size of background\.png"):
+        read_presses(tmp_path, ball_diameter=4e-3)

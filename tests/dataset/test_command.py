@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
+import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from raytac.cli import main
@@ -42,6 +45,63 @@ def test_render_resume_and_verify(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert read_metrics(tmp_path / "data/metrics.json")["rendered.shards"] == 1
     assert main([*asked, "--verify"]) == 0
     assert "2 shards are whole" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("kind", "name"), [("hdf5", "presses.h5"), ("zarr", "presses.zarr"), ("lerobot", "lerobot")])
+def test_exports_lie_beside_the_shards(kind: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "small.toml").write_text(SWEEP.replace("pitch_mm", "frames_per_stage = 2\npitch_mm"))
+    out = tmp_path / "data"
+    asked = [
+        "dataset",
+        str(tmp_path / "small.toml"),
+        "--out",
+        str(out),
+        "--device",
+        "cpu",
+        "--outputs",
+        "height,wrench",
+        "--count",
+        "2",
+    ]
+    assert main([*asked, "--export", kind, "--fps", "5"]) == 0
+    assert str(out / name) in capsys.readouterr().out
+    height = PressDataset(out)[1]["height"]
+    if kind == "lerobot":
+        import pyarrow.parquet as pq
+
+        table = pq.read_table(out / name / "data/chunk-000/file-000.parquet").to_pydict()
+        assert table["episode_index"][-1] == 1 and table["timestamp"][1] == pytest.approx(0.2)
+        np.testing.assert_allclose(table["observation.height"][-1], height[-1])
+    elif kind == "hdf5":
+        import h5py
+
+        with h5py.File(out / name) as file:
+            np.testing.assert_array_equal(np.asarray(file["height"])[1], height)
+    else:
+        import zarr
+
+        np.testing.assert_array_equal(zarr.open_array(str(out / name), path="height")[1], height)
+    assert main([*asked, "--export", kind]) == 2  # it is there already
+    assert "nothing is replaced" in capsys.readouterr().err
+
+
+def test_what_cannot_be_exported_is_refused_before_rendering(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "small.toml").write_text(SWEEP)
+    asked = ["dataset", str(tmp_path / "small.toml"), "--out", str(tmp_path / "data"), "--device", "cpu", "--count", "2"]
+    for options, text in (
+        (["--export", "lerobot"], "give it frames_per_stage"),
+        (["--export", "csv"], "did you mean|choose from"),
+        (["--export", "hdf5", "--fps", "0"], "fps = 0"),
+    ):
+        assert main([*asked, *options]) == 2
+        assert re.search(text, capsys.readouterr().err)
+    known = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "zarr" else known(name, *rest))
+    assert main([*asked, "--export", "zarr"]) == 2
+    assert "pip install 'raytac[export]'" in capsys.readouterr().err
+    assert not (tmp_path / "data").exists()
 
 
 @pytest.mark.parametrize(

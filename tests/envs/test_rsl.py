@@ -15,16 +15,19 @@ pytest.importorskip("rsl_rl.algorithms", exc_type=ImportError)
 
 import torch
 
-from experiments import play, train_gpu
+from raytac.cli import main
 from raytac.envs import SCRIPTED, FlatPolicy, RollBallVectorEnv
 from raytac.envs.rsl import RslVecEnv
 from raytac.errors import InputError
 from raytac.io import read_metrics
+from raytac.learn import STEPS, PolicyPlayer, PpoSettings, Training, shipped_policies, success_rate, train_policies
 
 OPTIONS = {"tactile": ("wrench",), "max_episode_steps": 4}
-SMALL = train_gpu.Args(
-    task="RollBall", num_envs=4, rollout=4, minibatches=2, epochs=2, episodes=4, hidden=8, device="cpu", evaluate_every=32
-)
+SMALL = PpoSettings(task="RollBall", num_envs=4, rollout=4, minibatches=2, epochs=2, episodes=4, hidden=8, evaluate_every=32)
+
+
+def trained(out: Path, **options: object) -> dict:
+    return train_policies(replace(SMALL, **options), out, device="cpu")  # type: ignore[arg-type]
 
 
 def played(env: RslVecEnv) -> list[torch.Tensor]:
@@ -66,10 +69,9 @@ def test_nothing_is_expected_from_beyond_a_failure() -> None:
 
 
 def test_a_training_that_was_cut_ends_as_one_that_was_not(tmp_path: Path) -> None:
-    whole = train_gpu.main(replace(SMALL, steps=64, out=tmp_path / "whole"))
-    cut = replace(SMALL, steps=32, out=tmp_path / "cut")
-    train_gpu.main(cut)
-    resumed = train_gpu.main(replace(cut, steps=64))
+    whole = trained(tmp_path / "whole", steps=64)
+    trained(tmp_path / "cut", steps=32)
+    resumed = trained(tmp_path / "cut", steps=64)
     assert whole["wrench.seed0.env_steps"] == resumed["wrench.seed0.env_steps"] == 64
     one, two = (torch.load(tmp_path / name / "wrench/seed0/checkpoint.pt", weights_only=True) for name in ("whole", "cut"))
     for name in ("actor_state_dict", "critic_state_dict"):
@@ -77,23 +79,22 @@ def test_a_training_that_was_cut_ends_as_one_that_was_not(tmp_path: Path) -> Non
             assert torch.equal(tensor, two[name][key]), key
     first = torch.load(tmp_path / "cut/wrench/seed0/policy.pt", weights_only=True)
     assert (tmp_path / "cut/wrench/seed0/policy.pt").stat().st_size < 2e6 and first["settings"]["history"] == 3
-    rated = play.main(
-        play.Args(policy=str(tmp_path / "cut/wrench/seed0/policy.pt"), episodes=3, film=False, out=tmp_path / "played")
-    )
-    assert rated["task"] == "RollBall" and rated["episodes"] == 3 and float(rated["length"]) > 1  # type: ignore[arg-type]
+    player = PolicyPlayer(tmp_path / "cut/wrench/seed0/policy.pt")
+    rated = success_rate(player, 3)
+    assert (player.task, rated.episodes) == ("RollBall", 3) and rated.mean_length > 1
     with pytest.raises(InputError, match="'hidden': 8"):
-        train_gpu.main(replace(cut, hidden=9))
-    again = train_gpu.main(replace(cut, steps=64))
+        trained(tmp_path / "cut", hidden=9)
+    again = trained(tmp_path / "cut", steps=64)
     for name in ("minutes", "env_steps_per_s", "success"):
         assert again[f"wrench.seed0.{name}"] == resumed[f"wrench.seed0.{name}"], name
     assert len((tmp_path / "cut/wrench/seed0/evaluation.csv").read_text().splitlines()) == 3
     for wrong in ({"history": 0}, {"steps": -5}, {"touch": "wrench,taste"}):
         with pytest.raises(InputError, match=next(iter(wrong))):
-            replace(cut, **wrong)
+            replace(SMALL, **wrong)
 
 
 def test_every_task_has_steps_to_train_for() -> None:
-    assert set(train_gpu.STEPS) == set(SCRIPTED)
+    assert set(STEPS) == set(SCRIPTED)
 
 
 def test_observations_are_there_before_a_reset() -> None:
@@ -105,11 +106,9 @@ def test_observations_are_there_before_a_reset() -> None:
 
 def test_metrics_are_of_the_worst_seed_of_the_first_touch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     successes = iter([3, 1, 0, 0])
-    played = train_gpu.Training.evaluate
-    monkeypatch.setattr(
-        train_gpu.Training, "evaluate", lambda self, *a, **k: replace(played(self, *a, **k), successes=next(successes))
-    )
-    found = train_gpu.main(replace(SMALL, steps=16, seeds="0,1", touch="none,wrench", out=tmp_path))
+    played = Training.evaluate
+    monkeypatch.setattr(Training, "evaluate", lambda self, *a, **k: replace(played(self, *a, **k), successes=next(successes)))
+    found = trained(tmp_path, steps=16, seeds="0,1", touch="none,wrench")
     speeds = [float(found[f"none.seed{k}.train_env_steps_per_s"]) for k in (0, 1)]  # type: ignore[arg-type]
     assert found["cpu.train.env_steps_per_s"] == min(speeds) > 0.0 and found["none.seed0.worlds"] == "mujoco"
     assert found["cpu.RollBall.success"] == 0.25 and found["none.seed0.success"] == 0.75 and found["wrench.seed1.success"] == 0.0
@@ -119,9 +118,9 @@ def test_metrics_are_of_the_worst_seed_of_the_first_touch(tmp_path: Path, monkey
 
 
 def test_a_policy_does_what_it_did_in_training(tmp_path: Path) -> None:
-    train_gpu.main(replace(SMALL, steps=16, touch="none", out=tmp_path))
+    trained(tmp_path, steps=16, touch="none")
     policy = FlatPolicy(tmp_path / "none/seed0/policy.pt")
-    training = train_gpu.Training(replace(SMALL, out=tmp_path), "none", 0, tmp_path / "none/seed0")
+    training = Training(SMALL, "none", 0, tmp_path / "none/seed0", "cpu")
     played = policy.vector(4)
     seen = training.env.reset(5)
     played.reset(5)
@@ -134,7 +133,7 @@ def test_a_policy_does_what_it_did_in_training(tmp_path: Path) -> None:
     training.close()
     (tmp_path / "other.pt").write_bytes(b"no policy")
     assert not FlatPolicy.is_one(tmp_path / "other.pt")
-    with pytest.raises(InputError, match="policy of train_gpu"):
+    with pytest.raises(InputError, match="must be a file of torch"):
         FlatPolicy(tmp_path / "other.pt")
 
 
@@ -152,15 +151,28 @@ def test_a_policy_does_what_it_did_in_training(tmp_path: Path) -> None:
 )
 def test_bad_options_are_named(tmp_path: Path, options: dict, text: str) -> None:
     with pytest.raises(InputError, match=text):
-        train_gpu.main(replace(SMALL, out=tmp_path / "out", **options))
+        trained(tmp_path / "out", **options)
 
 
 def test_policies_that_are_shipped_fit_their_environments() -> None:
-    shipped = sorted((Path(__file__).parents[2] / "experiments" / "policies").glob("*_ppo.pt"))
-    assert len(shipped) >= 3
-    for path in shipped:
+    assert len(shipped_policies()) >= 4
+    for path in shipped_policies().values():
         assert path.stat().st_size < 2e6 and FlatPolicy.is_one(path)
         policy = FlatPolicy(path)
         vector = policy.vector(1)
         actions = policy(vector.buffers["actor"])
         assert actions.shape == vector.buffers["action"].shape and np.isfinite(actions).all()
+
+
+def test_the_command_trains_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    small = "--num-envs 4 --rollout 4 --minibatches 2 --epochs 1 --episodes 2 --hidden 8 --device cpu"
+    asked = ["train", "--task", "RollBall", *small.split(), "--out", str(tmp_path)]
+    assert main([*asked, "--steps", "16"]) == 0
+    assert capsys.readouterr().out.strip() == str(tmp_path / "metrics.json")
+    assert PolicyPlayer(tmp_path / "wrench/seed0/policy.pt").task == "RollBall"
+    assert main([*asked, "--steps", "32"]) == 0 and main([*asked, "--steps", "32"]) == 0
+    assert "done before" in capsys.readouterr().err
+    assert read_metrics(tmp_path / "metrics.json")["wrench.seed0.env_steps"] == 32
+    assert main([*asked, "--gamma", "1.5"]) == 2
+    assert capsys.readouterr().err.strip().splitlines()[-1].startswith("raytac: error: gamma = 1.5")
+    assert main([*asked, "--touch", "none,taste"]) == 2

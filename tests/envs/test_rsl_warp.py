@@ -14,9 +14,9 @@ pytest.importorskip("rsl_rl.algorithms", exc_type=ImportError)
 
 import torch
 
-from experiments import train_gpu
 from raytac.envs import FlatPolicy, RollBallVectorEnv
 from raytac.envs.rsl import RslVecEnv, RslWarpEnv
+from raytac.learn import PpoSettings, train_policies
 
 pytestmark = pytest.mark.timeout(1200)  # the first test compiles MuJoCo Warp for the CPU: minutes
 
@@ -52,11 +52,11 @@ def test_rsl_rl_trains_on_observations_of_the_same_sizes() -> None:
 
 def test_a_training_on_mujoco_warp_writes_what_the_benchmarks_ask_for(tmp_path: Path) -> None:
     """One iteration in four worlds, with markers and wrench, and its policy is played."""
-    args = train_gpu.Args(
+    args = PpoSettings(
         task="PushCube", touch="markers+wrench", worlds="mujoco_warp", num_envs=4, rollout=4, steps=16, minibatches=2, epochs=1,
-        episodes=2, hidden=8, device="cpu", out=tmp_path,
+        episodes=2, hidden=8,
     )  # fmt: skip
-    found = train_gpu.main(args)
+    found = train_policies(args, tmp_path, device="cpu")
     assert 0.0 <= float(found["cpu.PushCube.success"]) <= 1.0 and float(found["cpu.PushCube.minutes"]) > 0.0
     assert float(found["cpu.train.env_steps_per_s"]) > 0.0 and found["markers_wrench.seed0.worlds"] == "mujoco_warp"
     assert FlatPolicy(tmp_path / "markers+wrench/seed0/policy.pt").tactile == ("markers", "wrench")

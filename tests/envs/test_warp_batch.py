@@ -147,7 +147,7 @@ def test_episodes_that_end_begin_again_and_leave_the_others_to_the_bit(device: s
         a, b = one.step(actions), other.step(actions)
         assert b.truncated.tolist() == [False, step == 4, False]
         for name, values in a.observation.items():
-            tolerance = 0.0 if device == "cpu" else 1e-4
+            tolerance = 0.0 if device == "cpu" else 1e-3 if name == "body" else 1e-4  # its velocities: 1 mm/s, 1 mrad/s
             torch.testing.assert_close(
                 values[[0, 2]], b.observation[name][[0, 2]], rtol=0.0, atol=tolerance, msg=f"{name}: {{}}".format
             )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments import bench_rl as bench
-from experiments import soak
+from experiments import soak, turns
 from raytac.envs import batch as env_batch
 from raytac.errors import InputError, RaytacError
 from raytac.io.metrics import read_metrics
@@ -121,42 +121,55 @@ def test_a_soak_run_sees_what_is_not_finite_and_what_grows() -> None:
     assert soak.summary(made_once)["memory_growth_mb"] == 1.0
 
 
-def test_two_checkouts_take_turns_and_the_ratio_is_the_median_of_the_rounds(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Figures come from the scripts of both; the order changes from round to round, which a machine that slows down would show."""
+def test_two_checkouts_take_turns_and_the_ratio_is_that_of_the_medians(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first round is not counted; the order changes from turn to turn, which a machine that slows down would show."""
     other, ours = tmp_path / "other", Path(bench.__file__).resolve().parents[1]
-    (other / "experiments").mkdir(parents=True)
-    (other / "experiments" / "bench_rl.py").write_text("")
-    calls: list[Path] = []
-    speeds = {ours: iter([30.0, 20.0, 90.0]), other: iter([10.0, 10.0, 10.0])}
+    (other / "ipc").mkdir(parents=True)
+    (other / "ipc" / "world.py").write_text("")
+    calls: list[tuple[Path, str]] = []
 
-    def figure_of(checkout: Path, mode: str, args: bench.Args) -> float:
-        calls.append(checkout)
-        return next(speeds[checkout])
+    class Turn:
+        def __init__(self, checkout: Path, scene: str) -> None:
+            self.checkout, self.scene = checkout, scene
 
-    monkeypatch.setattr(bench, "figure_of", figure_of)
-    found = bench.main(bench.Args(out=tmp_path / "out", device="cpu", modes="fots", against=other, rounds=3))
-    assert calls == [ours, other, other, ours, ours, other]
+        def step(self) -> tuple[float, float]:
+            calls.append((self.checkout, self.scene))
+            time = (1e-3 if self.checkout == ours else 3e-3) * (1.0 if len(calls) > 2 * turns.steps_of(self.scene) else 100.0)
+            return time, time if self.checkout == ours else 2.0 * time
+
+        def end(self) -> None:
+            pass
+
+    monkeypatch.setattr(turns, "Turn", Turn)
+    found = bench.main(bench.Args(out=tmp_path / "out", device="cpu", modes="fots,ball", against=other, rounds=2, envs=3))
+    assert [checkout for checkout, _ in calls[:4]] == [ours, other, other, ours]
+    assert {scene for _, scene in calls} == {"push:fots:3", "ball:rigid"}
     name = found["against"]
-    assert found[f"push.fots.speedup_vs_{name}"] == 3.0 and found["push.fots.speedup_most"] == 9.0
-    assert read_metrics(tmp_path / "out" / "metrics.json")["push.fots.env_steps_per_s"] == 30.0
+    assert found[f"push.fots.speedup_vs_{name}"] == found["push.fots.speedup_most"] == pytest.approx(3.0)
+    assert found["push.fots.processor_ms_per_step"] == pytest.approx(1.0)
+    assert found[f"push.fots.wall_speedup_vs_{name}"] == pytest.approx(6.0)
+    written = read_metrics(tmp_path / "out" / "metrics.json")
+    assert written[f"ball_rolling.rigid.speedup_vs_{name}"] == pytest.approx(3.0)
 
 
-def test_a_checkout_runs_its_own_script_in_a_process_of_its_own(tmp_path: Path) -> None:
-    (tmp_path / "experiments").mkdir()
-    script = tmp_path / "experiments" / "bench_rl.py"
-    script.write_text(
-        "import json, os, pathlib, sys\n"
-        "assert os.environ['PYTHONPATH'] == os.getcwd()\n"
-        "out = pathlib.Path(sys.argv[sys.argv.index('--out') + 1]); out.mkdir(parents=True)\n"
-        "values = {'experiment': 'x', 'device': 'cpu', 'seed': 0, 'wall_s': 1.0, 'versions.x': '1', 'push.fots.env_steps_per_s': 7.0}\n"
-        "(out / 'metrics.json').write_text(json.dumps(values))\n"
-    )
-    args = bench.Args(device="cpu", against=tmp_path)
-    assert bench.figure_of(tmp_path, "fots", args) == 7.0
-    script.write_text("raise SystemExit('broken on purpose')")
-    with pytest.raises(RaytacError, match="broken on purpose"):
-        bench.figure_of(tmp_path, "fots", args)
+@pytest.mark.slow
+def test_steps_of_worlds_in_turn_with_its_own(tmp_path: Path) -> None:
+    """This checkout against itself."""
+    bench.main(bench.Args(out=tmp_path, modes="none,ball", envs=2, rounds=1, against=Path(bench.__file__).resolve().parents[1]))
+    found = read_metrics(tmp_path / "metrics.json")
+    ratios = [float(value) for key, value in found.items() if "speedup_vs_" in key]
+    assert len(ratios) == 4 and all(0.4 < ratio < 2.5 for ratio in ratios)
+
+
+def test_what_cannot_take_turns_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    here, out = Path(bench.__file__).resolve().parents[1], tmp_path / "out"
+    for options, message in (
+        ({"device": "cuda"}, "device = 'cuda': must be the CPU with --against"),
+        ({"frames": True}, "is for environment steps, not for --frames"),
+        ({"rounds": 0}, "rounds = 0"),
+        ({"modes": "sight"}, "modes"),
+    ):
+        with pytest.raises(InputError, match=message):
+            bench.main(bench.Args(**{"device": "cpu", "out": out, "against": here, **options}))
     with pytest.raises(InputError, match="checkout"):
         bench.main(bench.Args(device="cpu", out=tmp_path / "out", against=tmp_path / "nowhere"))

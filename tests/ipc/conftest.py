@@ -1,16 +1,14 @@
-"""Shared by the solver's tests: quiet Warp, and small worlds."""
+"""Shared by the solver's tests: Warp started, and small worlds."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-import warp as wp
 
 import ipc
 from ipc.bodies import rotation_matrix
 
-wp.config.quiet = True  # pyright: ignore[reportAttributeAccessIssue]
-wp.init()
+ipc.start_warp()
 
 
 def unit_cell(cells: int = 2, size: float = 1.0) -> ipc.TetMesh:

@@ -26,12 +26,12 @@ QUICK = [
     *("peg_in_hole_affine", "needle_nu_0495", "d_hat_1um_soft", "d_hat_1um_affine", "d_hat_1mm_soft"),
     *("start_gap_1nm_soft", "start_gap_1nm_affine", "start_gap_1nm_soft_on_affine"),
 ]
-FAILING = {
-    "mat_twist_10_turns": "the mat snaps: 1 of 160 steps does not converge",
-}
-"""Cases that the solver does not pass, with the cause. A test here that passes fails: take it off the list then."""
-LONG = {"blocked_drive": 250}
-"""Newton iterations of cases that may take more than the others: det F falls to 0.015, and advances into the block are many."""
+LONG = {"blocked_drive": 250, "wrecking_ball": 1500}
+"""Newton iterations of cases that may take more than the others.
+
+A blocked drive: det F falls to 0.015, and advances into the block are many. The wrecking ball: two steps do not converge as a whole, and
+the attempt counts beside their halves.
+"""
 SETUP = Setup()
 FALL = ipc.Settings(gravity=(0.0, 0.0, -9.81))
 
@@ -50,17 +50,10 @@ def test_quick_cases_pass(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.xfail(reason=FAILING[name], strict=True)) if name in FAILING else name
-        for name in CASES
-        if name not in QUICK
-    ],
-)
+@pytest.mark.parametrize("name", [name for name in CASES if name not in QUICK])
 def test_slow_cases_pass(name: str) -> None:
     """Those that renew friction often take several solves a step."""
-    check(name, CASES[name](SETUP), most=MAX_NEWTON if name in GROUPS["basic"] else 5 * MAX_NEWTON)
+    check(name, CASES[name](SETUP), LONG.get(name, MAX_NEWTON if name in GROUPS["basic"] else 5 * MAX_NEWTON))
 
 
 @pytest.mark.slow

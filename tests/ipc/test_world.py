@@ -247,7 +247,7 @@ def test_teleport_takes_the_pad_along() -> None:
 
 def test_infeasible_drive_is_reported_as_blocked() -> None:
     """The ball is sent through the pad into the rigid case: it stops at the bonded base, and the report says how much remained."""
-    world = make_world()
+    world = make_world(halvings=0)
     start = world.frame("ball")[1][0]
     total = 0
     for _ in range(3):

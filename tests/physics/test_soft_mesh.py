@@ -71,9 +71,10 @@ def test_a_pad_is_symmetric():
         assert all(tuple(np.round(c * flip, 9) + 0.0) in cells for c in mesh.tets.vertices[mesh.tets.tets].mean(axis=1))
 
 
-def test_the_coarse_pad_has_volume_blocks_that_are_symmetric():
-    """24 tetrahedra of one layer each; the finer levels have none."""
-    mesh = pad_mesh(GELPAD, "coarse")
+@pytest.mark.parametrize(("level", "own"), [("coarse", 0.25), ("medium", 1.0)])
+def test_volume_blocks_are_symmetric(level, own):
+    """24 tetrahedra of one layer each; the fine level has none."""
+    mesh = pad_mesh(GELPAD, level)
     blocks = mesh.volume_blocks
     assert blocks is not None and (np.bincount(blocks) == 24).all() and len(blocks) == len(mesh.tets.tets)
     corners = mesh.tets.vertices[mesh.tets.tets]
@@ -82,7 +83,7 @@ def test_the_coarse_pad_has_volume_blocks_that_are_symmetric():
     assert len(keys) == blocks.max() + 1
     for flip in ((-1, 1, 1), (1, -1, 1)):
         assert all(tuple(np.round(m * flip, 9) + 0.0) in keys for m in middle)
-    assert pad_mesh(GELPAD, "medium").volume_blocks is None and pad_mesh(GELPAD, "fine").volume_blocks is None
+    assert mesh.own_volume == own and pad_mesh(GELPAD, "fine").volume_blocks is None
 
 
 def test_the_coat_covers_the_face_facing_out():

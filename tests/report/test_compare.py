@@ -17,10 +17,13 @@ from raytac.gel.surface import GelSurface
 from raytac.io.images import read_png
 from raytac.io.metrics import read_metrics
 from raytac.optics.base import OpticalMode, OpticsImages
+from raytac.optics.taxim.bake.settings import BakeSettings
+from raytac.optics.taxim.cache import table_folder
 from raytac.report.compare.modes import Mode, Setting, chosen_modes, comparison_modes
 from raytac.report.compare.page import FILES, write_comparison
 from raytac.report.compare.run import Comparison, run_comparison
-from raytac.report.compare.settings import CompareSettings, expected_seconds
+from raytac.report.compare.settings import CompareSettings, expected_bake_seconds, expected_seconds
+from raytac.specs.sensor import SensorSpec
 
 for package in ("skimage", "jinja2", "pyarrow"):
     pytest.importorskip(package)
@@ -208,6 +211,26 @@ def test_the_default_is_quick_enough_and_full_is_everything() -> None:
     assert CompareArgs(quick=True).settings().modes is None and CompareArgs(modes="all").settings().modes is None
     assert CompareArgs(modes="fast,path.spp4", full=True, spp=64).settings().reference_spp == 64
     assert [m.name for m in chosen_modes(every, ("fast", "path.spp4"))] == ["fast", "path.spp4"]
+
+
+def test_the_estimate_has_the_bake_of_a_table_that_is_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sensor_spec: SensorSpec
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    short, frames = CompareArgs().settings(), []
+    modes = chosen_modes(comparison_modes(short.spp), short.modes)
+    seconds = expected_bake_seconds(sensor_spec, modes, lambda: frames.append(1) or 0.02)
+    renders = BakeSettings().renders(sensor_spec.optics.shadows)
+    assert renders >= 400 and renders * 0.02 < seconds < 3 * renders * 0.02 and len(frames) == 1
+    assert expected_seconds(short, modes, 0.045, seconds) == pytest.approx(expected_seconds(short, modes, 0.045) + seconds)
+    folder = table_folder(sensor_spec, BakeSettings(), 0, sensor_spec.camera.resolution)
+    assert folder is not None and folder.is_relative_to(tmp_path)
+    folder.mkdir(parents=True)
+    assert expected_bake_seconds(sensor_spec, modes, lambda: frames.append(1) or 0.02) == 0.0
+    (tmp_path / "other").mkdir()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
+    assert expected_bake_seconds(sensor_spec, chosen_modes(modes, ("fast", "phong")), lambda: frames.append(1) or 0.02) == 0.0
+    assert len(frames) == 1, "no frame is timed if there is nothing to bake"
 
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "picture", "no picture"])

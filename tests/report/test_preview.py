@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.text import Text
 
 from raytac.gel.surface import GelSurface
 from raytac.io.images import read_png
@@ -108,18 +109,36 @@ def test_the_section_leaves_no_place_empty(
     check_stretch(section)
 
 
+def texts(data: PreviewData, sensor: SensorSpec, title: str) -> list[str]:
+    """Words inside of the panel whose title ends so."""
+    (axes,) = (axes for axes in draw_preview(data, sensor).axes if axes.get_title(loc="left").endswith(title))
+    return [text.get_text() for text in axes.texts]
+
+
 def test_traction_says_whether_it_lies_where_the_coat_was_at_rest(data: PreviewData, sensor_spec: SensorSpec) -> None:
-    now = replace(data, traction=np.full((*data.height.shape, 3), -1.0))
-    for shown, end in ((now, "[kPa]"), (replace(now, traction_at_rest=True), "[kPa], rest place")):
-        found = [title for title in titles(shown, sensor_spec) if "traction" in title]
-        assert len(found) == 2 and all(title.endswith(end) for title in found)
+    now = replace(data, traction=np.ones((*data.height.shape, 3)))
+    for kind in ("normal traction [kPa]", "shear traction [kPa]"):
+        assert texts(now, sensor_spec, kind) == []
+        assert texts(replace(now, traction_at_rest=True), sensor_spec, kind) == ["at the place of rest"]
 
 
 def test_without_shear_there_is_no_black_panel_of_it(data: PreviewData, sensor_spec: SensorSpec) -> None:
-    pressed = np.zeros((*data.height.shape, 3))
-    pressed[..., 2] = -1e3
-    found = [title for title in titles(replace(data, traction=pressed), sensor_spec) if "traction" in title]
-    assert len(found) == 1 and found[0].endswith("normal traction [kPa], no shear")
+    traction = np.zeros((*data.height.shape, 3))
+    traction[..., 2] = -1e3
+    shown = replace(data, traction=traction)
+    assert sum("traction" in title for title in titles(shown, sensor_spec)) == 1
+    assert texts(shown, sensor_spec, "normal traction [kPa]") == ["no shear"]
+
+
+def test_no_title_runs_beyond_its_panel(data: PreviewData, sensor_spec: SensorSpec) -> None:
+    """Over the colour bar or out of the sheet."""
+    for traction in (np.ones((*data.height.shape, 3)), np.array([0.0, 0.0, -1e3]) * np.ones((*data.height.shape, 1))):
+        figure = draw_preview(replace(data, traction=traction, traction_at_rest=True), sensor_spec)
+        figure.set_dpi(300)
+        figure.canvas.draw()
+        for axes in (axes for axes in figure.axes if axes.get_title(loc="left")):
+            title = next(text for text in axes.findobj(Text) if text.get_text() == axes.get_title(loc="left"))
+            assert title.get_window_extent().x1 <= axes.get_window_extent().x1 + 3, axes.get_title(loc="left")
 
 
 def test_the_section_is_never_at_minus_zero(data: PreviewData, sensor_spec: SensorSpec) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 from pathlib import Path
@@ -21,7 +22,7 @@ from raytac.cli.compare_real import CompareRealArgs
 from raytac.cli.shared import FROM_SCRATCH, OWN_LEDS, FitOptions, read_data
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, make_grid
-from raytac.io.images import write_png
+from raytac.io.images import read_png, write_png
 from raytac.optics import RayTraced
 from raytac.report.markers import run_calibrate_markers
 from raytac.report.real import RealSettings, real_splits, table_text
@@ -185,6 +186,32 @@ def test_calibrate_writes_a_sensor_that_needs_no_photograph(of_itself: tuple[Pat
     assert rest is not None
     off = np.abs(rest[0].astype(int) - background)
     assert off.mean() < 0.5 and off.max() <= 8, (off.mean(), off.max())
+
+
+def test_photographs_of_ones_own_become_a_sensor(
+    of_itself: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A folder of PNGs and the ball's diameter are enough: circles are searched for, and lights are fitted to them."""
+    (data, _), photos, out = of_itself, tmp_path / "photos", tmp_path / "out"
+    photos.mkdir()
+    for path in data.glob("*.png"):
+        shutil.copy(path, photos / path.name.replace("6.310mm_", "photo "))
+    asked = ["calibrate", str(photos), *ONE_ROUND, "--holdout", "3", "--out", str(out)]
+    assert main(asked) == 2 and "--ball-diameter-mm" in capsys.readouterr().err
+    assert main([*asked, "--ball-diameter-mm", "6.31"]) == 0
+    said = capsys.readouterr().out
+    metrics = json.loads((out / "metrics.json").read_text("utf-8"))
+    assert f"| held out | {metrics['held_out.contact_mae']:.2f} | {metrics['held_out.ring_mae']:.2f} |" in said
+    assert metrics["held_out.contact_mae"] < 2.5 and metrics["held_out.ring_mae"] < 1.0, metrics
+    with (data / "labels.csv").open() as labels, (out / "circles.csv").open() as result:
+        truth, circles = (list(csv.DictReader(file)) for file in (labels, result))
+    for one, other in zip(truth, circles, strict=True):
+        assert other["press"] == f"photo {int(one['index']):02d}"
+        off = [abs(float(one[key]) - float(other[key])) for key in ("cx_px", "cy_px", "r_px")]
+        assert max(off[:2]) < 1.5 and off[2] < 2.5, (one, other)
+    drawn = read_png(out / "fit.png").astype(int)
+    assert drawn.shape[1] > 250 and drawn.std() > 20
+    assert load_sensor(out / "sensor.toml").lights.leds
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from raytac.cli.played import dataset_session, policy_session, scripted_session
 from raytac.cli.view import ViewArgs
 from raytac.dataset import DatasetPlan, PressDataset, render_dataset
 from raytac.errors import InputError
+from raytac.learn import shipped_policies
 from raytac.observe import ObservationSettings
 from raytac.specs import PressRanges, SweepSpec, load_press, load_sensor
 
@@ -84,13 +85,18 @@ def test_a_scripted_policy_plays_an_episode_to_its_end():
 
 
 def test_a_trained_policy_plays_without_pytorch():
-    session = policy_session(POLICIES / "balance_pole_ppo.pt", shown=SHOWN, device="cpu", physics=None)
+    session = policy_session(shipped_policies()["balance_pole_ppo"], shown=SHOWN, device="cpu", physics=None)
     assert session.title == "BalancePole · balance_pole_ppo.pt"
     for _ in range(20):
         assert session.advance()
     shown = session.snapshot()
     assert shown.facts["episode"] == "0, running" and "PyTorch" not in shown.warning
     assert all(pad.rgb is not None for pad in shown.pads.values())
+
+
+def test_a_shipped_policy_is_viewed_by_its_name():
+    session = ViewArgs(scene="roll_ball_ppo", optics="phong", device="cpu")._played()
+    assert session is not None and session.title == "RollBall · roll_ball_ppo.pt" and session.advance()
 
 
 def test_a_policy_that_needs_pytorch_is_said_on_the_page(monkeypatch):

@@ -10,11 +10,12 @@ import pytest
 from PIL import Image
 
 from raytac.errors import BackendError, InputError
+from raytac.io.films import gif_bytes, mp4_bytes
 from raytac.view import saving
 from raytac.view.history import History
 from raytac.view.pictures import PICTURES, HeightScale, film_picture, films_equal_size, picture, pictures_of
 from raytac.view.recording import Stage, StatesSession, read_recording, recording_bytes
-from raytac.view.saving import MOST_PICTURES, Saver, gif_bytes, mp4_bytes
+from raytac.view.saving import MOST_PICTURES, Saver
 from raytac.view.session import PadView, Snapshot
 from tests.view.still import StillSession
 
@@ -102,7 +103,7 @@ def test_a_long_film_leaves_states_out_and_mp4_says_what_it_needs(tmp_path, monk
     monkeypatch.setattr(saving, "gif_bytes", lambda pictures, rate: drawn.append(len(pictures)) or b"GIF")
     save(Saver(tmp_path), "GIF", states(1) * (MOST_PICTURES + 50))
     assert drawn == [MOST_PICTURES]
-    monkeypatch.setattr(saving.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     text, client = save(Saver(tmp_path), "MP4", states(2))
     assert "pip install 'raytac[video]'" in text and not client.files
     with pytest.raises(BackendError):

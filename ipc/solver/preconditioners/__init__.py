@@ -18,7 +18,7 @@ __all__ = ["RestInverse", "make_preconditioner", "pays"]
 
 _TIGHT = 1e-4
 """Linear tolerance up to which the number of iterations decides."""
-_FEW_NODES, _MANY_NODES, _FEW_ENVIRONMENTS = 700, 3000, 16
+_FEW_NODES, _MANY_NODES, _FEW_ENVIRONMENTS = 600, 3000, 16
 _NEARLY_INCOMPRESSIBLE = 1 / (1 - 2 * 0.47)
 """λ/μ of the energy at ν = 0.47."""
 
@@ -28,8 +28,8 @@ def pays(layout: Layout, settings: Settings, batch: int, device: wp.Device) -> b
 
     ``docs/concepts/preconditioners.md`` says when.
 
-    On CUDA with a tight linear tolerance it does for pads of 700 free nodes or more, and for smaller ones in few environments. With a loose
-    one it does for 700 to 3,000 free nodes, and for more from ν = 0.47 on, if no other body is free. On a CPU applying a dense inverse
+    On CUDA with a tight linear tolerance it does for pads of 600 free nodes or more, and for smaller ones in few environments. With a loose
+    one it does for 600 to 3,000 free nodes, and for more from ν = 0.47 on, if no other body is free. On a CPU applying a dense inverse
     costs more than it saves.
     """
     bodies = bonded_bodies(layout)

@@ -1,13 +1,15 @@
 """The contacts of the moment as a low-rank part of a preconditioner.
 
 The rows q of the contact Hessian add Jᵀ S J at m contact nodes (J picks their 3m unknowns, S = Σ q qᵀ between them) to a matrix whose
-inverse C = K_0⁻¹ is known between all nodes of a surface. By Woodbury's identity
+inverse C = K_0⁻¹ is known: between all nodes of a pad's surface, and between the four nodes of an affine body, whose own 12 × 12 matrix
+A = L Lᵀ is factored in each Newton iteration. By Woodbury's identity
 
-    (K_0 + Jᵀ S J)⁻¹ = C − C Jᵀ W J C,      W = (S⁻¹ + J C Jᵀ)⁻¹.
+    (K_0 + Jᵀ S J)⁻¹ = C − C Jᵀ W J C,      W = (S⁻¹ + J C Jᵀ)⁻¹ = K − K (K + S)⁻¹ K,      K = (J C Jᵀ)⁻¹.
 
-S is not regular (friction may be missing), so a share REGULAR of the elastic stiffness of each contact node is added to it. W is computed
-in double precision by one block of threads an environment. An environment with more contact nodes than there is room for is marked as
-one that does not fit: with part of its contacts the identity is of little use.
+The second form needs no inverse of S, which is not regular where friction is missing. An affine body is 10⁶ times as stiff against strain
+as against motion: its unknowns are Lᵀ x and its rows L⁻¹ q here, for which K = 1; otherwise the difference would be lost to rounding.
+W is computed in double precision by one block of threads an environment. An environment with more contact nodes than there is room
+for is marked as one that does not fit: with part of its contacts the identity is of little use.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -17,26 +19,27 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.arrays import IntArray, IntArray2d, MatArray2d, SingleArray2d, SingleArray3d
+from ipc.arrays import FloatArray2d, IntArray, IntArray2d, MatArray2d, SingleArray3d, VecArray2d
 from ipc.contact.contacts import Contacts, mat34d, rows_of
+from ipc.solver.affine_elimination import Elimination, affine_first, affine_part, finish_elimination
 from ipc.solver.blocks import wait_for_block
 from ipc.solver.linear import SystemView, row_column
 
 wp.set_module_options({"enable_backward": False})
 
-REGULAR = 1e-6
-"""Stiffness added to every contact node, as a share of its elastic one."""
+mat1212d = wp.types.matrix(shape=(12, 12), dtype=wp.float64)
 LANES = 256
 """Threads on CUDA for the small system of an environment; the size of all blocks."""
 
 
 @wp.struct
 class Rest:
-    """K_0⁻¹ between the interface nodes of every bonded body, s of them on its surface.
+    """K_0⁻¹ between the interface nodes of a bonded body and the nodes of an affine one.
 
-    ``inverse`` holds the matrices one after the other, row by row; unknown u of part p is entry u − first[p] of a matrix of width[p]
-    that starts at start[p]. ``unknown`` (N,) is a node's first unknown or −1, ``part`` (N,) its matrix, ``surface`` (N,) its number among
-    the surface nodes or −1, ``surface_node`` (s,) the inverse of that.
+    ``inverse`` holds the matrices of bonded bodies one after the other, row by row; unknown u of part p is entry u − first[p] of a matrix
+    of width[p] that starts at start[p]. ``unknown`` (N,) is a node's first unknown or −1, ``part`` (N,) its matrix. s nodes may touch
+    something, those on bonded surfaces and of affine bodies: ``surface`` (N,) is a node's number among them or −1, ``surface_node`` (s,)
+    the inverse of that. ``affine`` (N,) is a node's number among the affine nodes, body by body, or −1; ``affine_node`` (A,) the inverse.
     """
 
     inverse: wp.array(dtype=wp.float32)
@@ -47,6 +50,8 @@ class Rest:
     part: IntArray
     surface: IntArray
     surface_node: IntArray
+    affine: IntArray
+    affine_node: IntArray
 
 
 @wp.struct
@@ -54,21 +59,27 @@ class Small:
     """The contact nodes of each environment and their systems; m is the room.
 
     ``touched``, ``slot`` (B, s): mark of a surface node that touches, and its place among the contact nodes.
-    ``count`` (B,): contact nodes; more than m do not fit.    ``node`` (B, m).
-    ``a`` (B, m, m), ``row``, ``column`` (B, m): work space.    ``w`` (B, 3m, 3m): W [N/m].
-    ``t``, ``force`` (B, 3m): J K_0⁻¹ r [m] and W t [N].
+    ``count`` (B,): contact nodes; more than m do not fit.    ``pads`` (B,): those of pads, the first ones.    ``node`` (B, m).
+    ``a`` (B, m, m): S, then (K + S)⁻¹.    ``k`` (B, m, m): K.    ``product`` (B, m, m), ``row``, ``column`` (B, m): work space.
+    ``w`` (B, 3m, 3m): W [N/m].
+    ``t``, ``force`` (B, 3m): J K_0⁻¹ r [m], on affine nodes L⁻¹ r, and W t [N].
+    ``root`` (B, A, 4): blocks of an affine node's row of L⁻¹, at the nodes of its body.
     """
 
     touched: IntArray2d
     slot: IntArray2d
     count: IntArray
+    pads: IntArray
     node: IntArray2d
     a: wp.array3d(dtype=wp.mat33d)
+    k: wp.array3d(dtype=wp.mat33d)
+    product: wp.array3d(dtype=wp.mat33d)
     row: MatArray2d
     column: MatArray2d
-    w: SingleArray3d
-    t: SingleArray2d
-    force: SingleArray2d
+    w: wp.array3d(dtype=wp.float64)
+    t: FloatArray2d
+    force: FloatArray2d
+    root: wp.array3d(dtype=wp.mat33d)
 
 
 @wp.func
@@ -90,6 +101,7 @@ def forget_contacts(active: IntArray, small: Small):
         return
     if s == 0:
         small.count[env] = 0
+        small.pads[env] = 0
     small.touched[env, s] = 0
 
 
@@ -110,20 +122,27 @@ def mark_contacts(system: SystemView, contacts: Contacts, rest: Rest, active: In
     if active[env] == 0:
         return
     for r in range(lane, rows_of(contacts, env), lanes):
+        if contacts.concave[env, r] != 0:
+            continue
         verts, row = contacts.row_verts[env, r], contacts.row[env, r]
         for k in range(4):
-            s = surface_of_vertex(system, rest, verts[k])
-            if s >= 0 and wp.length_sq(row_column(row, k)) > wp.float64(0.0):
-                small.touched[env, s] = 1
+            v = verts[k]
+            if v >= 0 and wp.length_sq(row_column(row, k)) > wp.float64(0.0):
+                for m in range(system.verts.count[v]):
+                    s = rest.surface[system.verts.nodes[v, m]]
+                    if s >= 0:
+                        small.touched[env, s] = 1
 
 
 @wp.kernel
 def place_contacts(rest: Rest, active: IntArray, small: Small):
-    """Numbers the contact nodes in the order of the surface."""
+    """Numbers the contact nodes as ``surface_node`` has them, those of pads first."""
     env, s = wp.tid()
     if active[env] == 0 or small.touched[env, s] == 0:
         return
     wp.atomic_add(small.count, env, 1)
+    if rest.affine[rest.surface_node[s]] < 0:
+        wp.atomic_add(small.pads, env, 1)
     place = wp.int32(0)
     for other in range(s):
         place += small.touched[env, other]
@@ -133,19 +152,83 @@ def place_contacts(rest: Rest, active: IntArray, small: Small):
 
 
 @wp.func
+def slot_of(env: wp.int32, rest: Rest, small: Small, first: wp.int32) -> wp.int32:
+    """Place of an affine body's first node among the contact nodes, or −1.
+
+    The other three follow. −1: nothing touches it.
+    """
+    if first >= 0:
+        if small.touched[env, rest.surface[first]] != 0:
+            return small.slot[env, rest.surface[first]]
+    return -1
+
+
+@wp.func
+def scaled_part(
+    system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, rest: Rest, small: Small, first: wp.int32
+) -> mat34d:
+    """L⁻¹ q of a row at the nodes of an affine body."""
+    g, scaled = affine_part(system, verts, row, env, first), mat34d()
+    for i in range(4):
+        v = wp.vec3d()
+        for j in range(i + 1):
+            v += small.root[env, rest.affine[first] + i, j] * row_column(g, j)
+        for c in range(3):
+            scaled[c, i] = v[c]
+    return scaled
+
+
+@wp.func
+def add_between(env: wp.int32, small: Small, a: wp.int32, g: mat34d, b: wp.int32, h: mat34d):
+    """S += g hᵀ between the nodes of two affine bodies, or of one."""
+    for m in range(4):
+        for n in range(4):
+            wp.atomic_add(small.a, env, a + m, b + n, wp.outer(row_column(g, m), row_column(h, n)))
+
+
+@wp.func
+def add_beside(env: wp.int32, small: Small, i: wp.int32, q: wp.vec3d, a: wp.int32, g: mat34d):
+    """S += q gᵀ + g qᵀ between a contact node and the nodes of an affine body."""
+    for m in range(4):
+        block = wp.outer(q, row_column(g, m))
+        wp.atomic_add(small.a, env, i, a + m, block)
+        wp.atomic_add(small.a, env, a + m, i, wp.transpose(block))
+
+
+@wp.func
 def add_row(env: wp.int32, system: SystemView, verts: wp.vec4i, row: mat34d, rest: Rest, small: Small):
     """S += q qᵀ between the contact nodes, in the frames of their bodies."""
+    one = affine_first(system, verts, -1)
+    a, b = slot_of(env, rest, small, one), wp.int32(-1)
+    g, h = mat34d(), mat34d()
+    if a >= 0:
+        g = scaled_part(system, verts, row, env, rest, small, one)
+        add_between(env, small, a, g, a, g)
+    if one >= 0:
+        other = affine_first(system, verts, one)
+        b = slot_of(env, rest, small, other)
+        if b >= 0:
+            h = scaled_part(system, verts, row, env, rest, small, other)
+            add_between(env, small, b, h, b, h)
+            if a >= 0:
+                add_between(env, small, a, g, b, h)
+                add_between(env, small, b, h, a, g)
     for k in range(4):
         s = surface_of_vertex(system, rest, verts[k])
         if s >= 0:
             qi = wp.transpose(system.R[env, system.verts.body[verts[k]]]) * row_column(row, k)
             if wp.length_sq(qi) > wp.float64(0.0):
+                i = small.slot[env, s]
                 for m in range(4):
-                    other = surface_of_vertex(system, rest, verts[m])
-                    if other >= 0:
+                    other_s = surface_of_vertex(system, rest, verts[m])
+                    if other_s >= 0:
                         qj = wp.transpose(system.R[env, system.verts.body[verts[m]]]) * row_column(row, m)
                         if wp.length_sq(qj) > wp.float64(0.0):
-                            wp.atomic_add(small.a, env, small.slot[env, s], small.slot[env, other], wp.outer(qi, qj))
+                            wp.atomic_add(small.a, env, i, small.slot[env, other_s], wp.outer(qi, qj))
+                if a >= 0:
+                    add_beside(env, small, i, qi, a, g)
+                if b >= 0:
+                    add_beside(env, small, i, qi, b, h)
 
 
 @wp.kernel
@@ -155,43 +238,105 @@ def add_rows(system: SystemView, contacts: Contacts, rest: Rest, active: IntArra
     if active[env] == 0 or not fits(small, env):
         return
     for r in range(lane, rows_of(contacts, env), lanes):
-        add_row(env, system, contacts.row_verts[env, r], contacts.row[env, r], rest, small)
+        if contacts.concave[env, r] == 0:
+            add_row(env, system, contacts.row_verts[env, r], contacts.row[env, r], rest, small)
 
 
 @wp.func
-def invert_small(small: Small, env: wp.int32, m: wp.int32, lane: wp.int32, lanes: wp.int32) -> wp.bool:
+def invert_small(
+    a: wp.array3d(dtype=wp.mat33d), small: Small, env: wp.int32, m: wp.int32, lane: wp.int32, lanes: wp.int32
+) -> wp.bool:
     """Inverts the positive definite blocks ``a`` in place (Gauss-Jordan, without pivoting).
 
     All lanes of the environment work on it and get the same result: False where a pivot is not positive.
     """
     wait_for_block()
     for k in range(m):
-        pivot = small.a[env, k, k]
+        pivot = a[env, k, k]
         if not (wp.determinant(pivot) > wp.float64(0.0) and wp.trace(pivot) > wp.float64(0.0)):
             return False
         inverse = wp.inverse(pivot)
         for i in range(lane, m, lanes):
-            small.column[env, i] = small.a[env, i, k]
-            small.row[env, i] = inverse * small.a[env, k, i]
+            small.column[env, i] = a[env, i, k]
+            small.row[env, i] = inverse * a[env, k, i]
         wait_for_block()
         for e in range(lane, m * m, lanes):
             i = e / m
             j = e - m * i
             if i == k and j == k:
-                small.a[env, i, j] = inverse
+                a[env, i, j] = inverse
             elif i == k:
-                small.a[env, i, j] = small.row[env, j]
+                a[env, i, j] = small.row[env, j]
             elif j == k:
-                small.a[env, i, j] = -(small.column[env, i] * inverse)
+                a[env, i, j] = -(small.column[env, i] * inverse)
             else:
-                small.a[env, i, j] = small.a[env, i, j] - small.column[env, i] * small.row[env, j]
+                a[env, i, j] = a[env, i, j] - small.column[env, i] * small.row[env, j]
         wait_for_block()
     return True
 
 
+@wp.kernel
+def factor_affine(rest: Rest, system: SystemView, active: IntArray, small: Small):
+    """L⁻¹ of every affine body.
+
+    Where its matrix is not positive definite, that of the mean diagonal of its blocks.
+    """
+    env, body = wp.tid()
+    if active[env] == 0:
+        return
+    first = 4 * body
+    A = mat1212d()
+    for i in range(4):
+        node = rest.affine_node[first + i]
+        k = system.row_base[node]
+        for _ in range(system.row_length[node]):
+            j = rest.affine[system.col[k]] - first
+            block = system.blocks[env, k]
+            for p in range(3):
+                for q in range(3):
+                    A[3 * i + p, 3 * j + q] = block[p, q]
+            k += system.stride
+    good = wp.bool(True)
+    for j in range(12):
+        d = A[j, j]
+        for n in range(j):
+            d -= A[j, n] * A[j, n]
+        if not (d > wp.float64(0.0)):
+            good = wp.bool(False)
+            d = wp.float64(1.0)
+        d = wp.sqrt(d)
+        A[j, j] = d
+        for i in range(j + 1, 12):
+            e = A[i, j]
+            for n in range(j):
+                e -= A[i, n] * A[j, n]
+            A[i, j] = e / d
+    # L⁻¹ in the place of L.
+    for j in range(12):
+        A[j, j] = wp.float64(1.0) / A[j, j]
+        for i in range(j + 1, 12):
+            e = wp.float64(0.0)
+            for n in range(j, i):
+                e -= A[i, n] * A[n, j]
+            A[i, j] = e / A[i, i]
+    for i in range(4):
+        for j in range(4):
+            block = wp.mat33d()
+            if good:
+                for p in range(3):
+                    for q in range(3):
+                        if 3 * i + p >= 3 * j + q:
+                            block[p, q] = A[3 * i + p, 3 * j + q]
+            elif i == j:
+                node = rest.affine_node[first + i]
+                size = wp.abs(wp.trace(system.blocks[env, system.diagonal[node]])) / wp.float64(3.0)
+                block = (wp.float64(1.0) / wp.sqrt(wp.max(size, wp.float64(1.0e-30)))) * wp.identity(n=3, dtype=wp.float64)
+            small.root[env, first + i, j] = block
+
+
 @wp.func
-def compliance(rest: Rest, a: wp.int32, b: wp.int32) -> wp.mat33d:
-    """The block of K_0⁻¹ between two nodes."""
+def rest_block(rest: Rest, a: wp.int32, b: wp.int32) -> wp.mat33d:
+    """The block of K_0⁻¹ between two nodes of pads."""
     block = wp.mat33d()
     part = rest.part[a]
     if part == rest.part[b]:
@@ -207,27 +352,50 @@ def factor_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
     env, lane = wp.tid()
     if active[env] == 0 or not fits(small, env):
         return
-    m = small.count[env]
-    for i in range(lane, m, lanes):
-        C = compliance(rest, small.node[env, i], small.node[env, i])
-        soft = wp.float64(3.0 * REGULAR) / wp.trace(C)
-        small.a[env, i, i] = small.a[env, i, i] + soft * wp.identity(n=3, dtype=wp.float64)
-    good = invert_small(small, env, m, lane, lanes)
+    m, pads = small.count[env], small.pads[env]
+    for e in range(lane, m * m, lanes):
+        i = e / m
+        j = e - m * i
+        if i < pads and j < pads:
+            small.k[env, i, j] = rest_block(rest, small.node[env, i], small.node[env, j])
+        elif i == j:
+            small.k[env, i, j] = wp.identity(n=3, dtype=wp.float64)
+        else:
+            small.k[env, i, j] = wp.mat33d()
+    good = invert_small(small.k, small, env, pads, lane, lanes)
     if good:
         for e in range(lane, m * m, lanes):
             i = e / m
             j = e - m * i
-            small.a[env, i, j] = small.a[env, i, j] + compliance(rest, small.node[env, i], small.node[env, j])
-        good = invert_small(small, env, m, lane, lanes)
+            small.a[env, i, j] = small.a[env, i, j] + small.k[env, i, j]
+        good = invert_small(small.a, small, env, m, lane, lanes)
     wait_for_block()
     if good:
         for e in range(lane, m * m, lanes):
             i = e / m
             j = e - m * i
-            W = wp.float64(0.5) * (small.a[env, i, j] + wp.transpose(small.a[env, j, i]))
+            if i < j:
+                T = wp.float64(0.5) * (small.a[env, i, j] + wp.transpose(small.a[env, j, i]))
+                small.a[env, i, j] = T
+                small.a[env, j, i] = wp.transpose(T)
+        wait_for_block()
+        for e in range(lane, m * m, lanes):
+            i = e / m
+            j = e - m * i
+            total = wp.mat33d()
+            for n in range(m):
+                total += small.k[env, i, n] * small.a[env, n, j]
+            small.product[env, i, j] = total
+        wait_for_block()
+        for e in range(lane, m * m, lanes):
+            i = e / m
+            j = e - m * i
+            W = small.k[env, i, j]
+            for n in range(m):
+                W -= small.product[env, i, n] * small.k[env, n, j]
             for p in range(3):
                 for q in range(3):
-                    small.w[env, 3 * i + p, 3 * j + q] = wp.float32(W[p, q])
+                    small.w[env, 3 * i + p, 3 * j + q] = W[p, q]
     elif lane == 0:
         # Something is not finite: without contacts it is still a preconditioner.
         small.count[env] = 0
@@ -245,20 +413,62 @@ def sum_of_parts(y: SingleArray3d, env: wp.int32, u: wp.int32) -> wp.float32:
 
 
 @wp.kernel
-def contact_forces(rest: Rest, y: SingleArray3d, running: IntArray, lanes: wp.int32, small: Small):
-    """W J K_0⁻¹ r, one block of threads an environment."""
+def contact_forces(rest: Rest, y: SingleArray3d, z: VecArray2d, running: IntArray, lanes: wp.int32, small: Small):
+    """W t; y holds K_0⁻¹ r of pads, z L⁻¹ r of affine nodes.
+
+    One block of threads an environment.
+    """
     env, lane = wp.tid()
     if running[env] == 0 or not fits(small, env):
         return
     n = 3 * small.count[env]
     for i in range(lane, n, lanes):
-        small.t[env, i] = sum_of_parts(y, env, rest.unknown[small.node[env, i / 3]] + i % 3)
+        node = small.node[env, i / 3]
+        if rest.affine[node] >= 0:
+            small.t[env, i] = z[env, node][i % 3]
+        else:
+            small.t[env, i] = wp.float64(sum_of_parts(y, env, rest.unknown[node] + i % 3))
     wait_for_block()
     for i in range(lane, n, lanes):
-        total = wp.float32(0.0)
+        total = wp.float64(0.0)
         for j in range(n):
             total += small.w[env, j, i] * small.t[env, j]
         small.force[env, i] = total
+
+
+@wp.kernel
+def eliminate_where_full(
+    e: Elimination, inverse: MatArray2d, small: Small, r: VecArray2d, running: IntArray, threads: wp.int32, z: VecArray2d
+):
+    """Affine bodies eliminated from 3×3 blocks, in environments that do not fit."""
+    env, lane = wp.tid()
+    if running[env] != 0 and not fits(small, env):
+        finish_elimination(e, inverse, env, lane, threads, r, z)
+
+
+@wp.func
+def scaled_force(rest: Rest, small: Small, env: wp.int32, a: wp.int32, r: VecArray2d) -> wp.vec3d:
+    """L⁻¹ r at affine node a."""
+    f = wp.vec3d()
+    first = 4 * (a / 4)
+    for j in range(a - first + 1):
+        f += small.root[env, a, j] * r[env, rest.affine_node[first + j]]
+    return f
+
+
+@wp.func
+def affine_motion(rest: Rest, small: Small, env: wp.int32, a: wp.int32, r: VecArray2d) -> wp.vec3d:
+    """L⁻ᵀ (L⁻¹ r − W t) at affine node a."""
+    x = wp.vec3d()
+    first = 4 * (a / 4)
+    s = rest.surface[rest.affine_node[first]]
+    for i in range(a - first, 4):
+        f = scaled_force(rest, small, env, first + i, r)
+        if small.touched[env, s] != 0:
+            k = 3 * (small.slot[env, s] + i)
+            f -= wp.vec3d(small.force[env, k], small.force[env, k + 1], small.force[env, k + 2])
+        x += wp.transpose(small.root[env, first + i, a - first]) * f
+    return x
 
 
 class LowRank:
@@ -280,18 +490,24 @@ class LowRank:
 
         small = Small()
         small.touched, small.slot = zeros(batch, nodes, dtype=wp.int32), zeros(batch, nodes, dtype=wp.int32)
-        small.count, small.node = zeros(batch, dtype=wp.int32), zeros(batch, room, dtype=wp.int32)
-        small.a = zeros(batch, room, room, dtype=wp.mat33d)
+        small.count, small.pads = zeros(batch, dtype=wp.int32), zeros(batch, dtype=wp.int32)
+        small.node = zeros(batch, room, dtype=wp.int32)
+        small.a, small.k, small.product = (zeros(batch, room, room, dtype=wp.mat33d) for _ in range(3))
         small.row, small.column = zeros(batch, room, dtype=wp.mat33d), zeros(batch, room, dtype=wp.mat33d)
-        small.w, small.t, small.force = zeros(batch, 3 * room, 3 * room), zeros(batch, 3 * room), zeros(batch, 3 * room)
+        small.w = zeros(batch, 3 * room, 3 * room, dtype=wp.float64)
+        small.t, small.force = zeros(batch, 3 * room, dtype=wp.float64), zeros(batch, 3 * room, dtype=wp.float64)
+        self.bodies = len(rest.affine_node) // 4
+        small.root = zeros(batch, 4 * self.bodies, 4, dtype=wp.mat33d)
         self.small = small
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, block_dim: int = 256) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block_dim)
 
     def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
-        """Take in the rows of the active environments."""
+        """Take in the affine bodies and the rows of the active environments."""
         rest, small = self.rest, self.small
+        if self.bodies:
+            self._launch(factor_affine, (self.batch, self.bodies), [rest, system, active, small])
         self._launch(forget_contacts, small.touched.shape, [active, small])
         if rows:
             inputs = [system, contacts, rest, active, self.row_lanes, small]
@@ -300,6 +516,9 @@ class LowRank:
             self._launch(add_rows, (self.batch, self.row_lanes), inputs)
             self._launch(factor_small, (self.batch, self.lanes), [rest, active, self.lanes, small], self.lanes)
 
-    def find_forces(self, y: wp.array, running: wp.array) -> None:
-        """``small.force`` = W J y for the running environments; y is the sum of (parts, B, n)."""
-        self._launch(contact_forces, (self.batch, self.lanes), [self.rest, y, running, self.lanes, self.small], self.lanes)
+    def find_forces(self, y: wp.array, z: wp.array, running: wp.array) -> None:
+        """Compute ``small.force`` = W t for the running environments.
+
+        y (parts, B, n) holds K_0⁻¹ r of pads, z (B, N) L⁻¹ r of affine nodes.
+        """
+        self._launch(contact_forces, (self.batch, self.lanes), [self.rest, y, z, running, self.lanes, self.small], self.lanes)

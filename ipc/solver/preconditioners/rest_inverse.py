@@ -2,13 +2,14 @@
 
 A bonded body has, in its own frame, one rest matrix K_0 = M/h² + K(rest) for every environment and step. It is inverted once
 (``substructure.py``), in single precision, and the contacts are added as a low-rank part (``low_rank.py``): M is exact as long as
-the body is at rest, and PCG deals with what deformation changes. Nodes of other bodies, and environments with more contacts than there
-is room for, have block-Jacobi. Across a batch the application is a product of matrices that every environment shares. On CUDA
+the body is at rest, and PCG deals with what deformation changes. Affine bodies are part of it with their own matrices, so that what
+a pad presses against moves with it. Free soft bodies, and environments with more contacts than there is room for, have block-Jacobi.
+Across a batch the application is a product of matrices that every environment shares. On CUDA
 everything is a launch of fixed size on arrays of fixed address, so that it can be part of a graph.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
-# pyright: reportIndexIssue=false, reportInvalidTypeForm=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false
 
 from __future__ import annotations
 
@@ -19,9 +20,22 @@ from ipc.arrays import IntArray, MatArray2d, SingleArray2d, SingleArray3d, VecAr
 from ipc.bodies.layout import Layout
 from ipc.contact.contacts import Contacts
 from ipc.settings import Settings
+from ipc.solver.affine_elimination import affine_nodes
 from ipc.solver.block_jacobi import BlockJacobi
+from ipc.solver.blocks import THREADS as BLOCK_THREADS
 from ipc.solver.linear import SystemView
-from ipc.solver.preconditioners.low_rank import LANES, LowRank, Rest, Small, fits, rest_entry, sum_of_parts
+from ipc.solver.preconditioners.low_rank import (
+    LANES,
+    LowRank,
+    Rest,
+    Small,
+    affine_motion,
+    eliminate_where_full,
+    fits,
+    rest_entry,
+    scaled_force,
+    sum_of_parts,
+)
 from ipc.solver.preconditioners.rest_stiffness import bonded_bodies, rest_blocks
 from ipc.solver.preconditioners.substructure import Patch, choose_partition, condense
 
@@ -33,8 +47,11 @@ TILED_FROM = 8
 """Number of environments from which tiles are used instead of products with vectors."""
 THREADS = 200_000
 """Threads of a product with vectors; a GPU needs many to read memory at its full rate."""
-MAX_CONTACTS = 48
-"""Contact nodes that an environment may have; factoring costs their number cubed."""
+MAX_CONTACTS = 128
+"""Most contact nodes that an environment may have; factoring costs their number cubed."""
+_BLOCK_BYTES = 72
+CONTACT_BYTES = 2**30
+"""Memory that the contacts of all environments may take."""
 
 
 @wp.kernel
@@ -163,11 +180,17 @@ def gather_interface(
     x: SingleArray2d,
     z: VecArray2d,
 ):
-    """r_Γ − Σ E_pᵀ r_p on the interface; z of nodes that have block-Jacobi."""
+    """r_Γ − Σ E_pᵀ r_p on the interface.
+
+    z of nodes that have block-Jacobi, and L⁻¹ r in the place of z of affine bodies.
+    """
     env, i = wp.tid()
     if running[env] == 0:
         return
     u = rest.unknown[i]
+    if rest.affine[i] >= 0 and fits(small, env):
+        z[env, i] = scaled_force(rest, small, env, rest.affine[i], r)
+        return
     if (u < 0 and inside.unknown[i] < 0) or not fits(small, env):
         z[env, i] = jacobi[env, i] * r[env, i]
         return
@@ -182,12 +205,28 @@ def gather_interface(
 
 @wp.kernel
 def scatter_interface(
-    rest: Rest, inside: Inside, small: Small, y: SingleArray3d, running: IntArray, z: VecArray2d, x_back: SingleArray2d
+    rest: Rest,
+    inside: Inside,
+    small: Small,
+    r: VecArray2d,
+    y: SingleArray3d,
+    running: IntArray,
+    # outputs
+    z: VecArray2d,
+    x_back: SingleArray2d,
 ):
-    """x_Γ = S⁻¹ g − S⁻¹ Jᵀ W J S⁻¹ g, and a copy for every patch that borders on the node."""
+    """x_Γ = S⁻¹ g − S⁻¹ Jᵀ W J S⁻¹ g, with a copy for every patch that borders on the node.
+
+    x of affine bodies.
+    """
     env, i = wp.tid()
+    if running[env] == 0 or not fits(small, env):
+        return
+    if rest.affine[i] >= 0:
+        z[env, i] = affine_motion(rest, small, env, rest.affine[i], r)
+        return
     u = rest.unknown[i]
-    if running[env] == 0 or u < 0 or not fits(small, env):
+    if u < 0:
         return
     part = rest.part[i]
     value = wp.vec3(sum_of_parts(y, env, u), sum_of_parts(y, env, u + 1), sum_of_parts(y, env, u + 2))
@@ -196,7 +235,7 @@ def scatter_interface(
         if rest.part[node] == part:
             v = rest.unknown[node]
             for c in range(3):
-                f = small.force[env, 3 * k + c]
+                f = wp.float32(small.force[env, 3 * k + c])
                 for d in range(3):
                     value[d] = value[d] - f * rest_entry(rest, part, v + c, u + d)
     z[env, i] = wp.vec3d(wp.float64(value[0]), wp.float64(value[1]), wp.float64(value[2]))
@@ -221,18 +260,23 @@ def scatter_inside(
     z[env, i] = value
 
 
+def room(batch: int) -> int:
+    """Contact nodes for which each of so many environments has memory."""
+    return int(min(MAX_CONTACTS, (CONTACT_BYTES / (4 * _BLOCK_BYTES * batch)) ** 0.5))
+
+
 def padded(n: int) -> int:
     """The next multiple of a tile."""
     return -(-n // TILE_OUT) * TILE_OUT
 
 
 class RestInverse:
-    """K_0⁻¹ of the bonded bodies with their contacts, and block-Jacobi elsewhere.
+    """K_0⁻¹ of the bonded and the affine bodies with their contacts, and block-Jacobi elsewhere.
 
     Args:
         layout: with a bonded body at least.
         lanes: threads that share the contact rows of an environment.
-        max_contacts: contact nodes that an environment may have; with more it has block-Jacobi.
+        max_contacts: contact nodes that an environment may have; with more it has block-Jacobi. None: as many as :func:`room` says.
         patches: into how many the inside of every body is cut, a power of two; 0 for none; None: as few operations as possible.
 
     Raises:
@@ -246,7 +290,7 @@ class RestInverse:
         batch: int,
         lanes: int,
         device: wp.Device,
-        max_contacts: int = MAX_CONTACTS,
+        max_contacts: int | None = None,
         patches: int | None = None,
     ) -> None:
         self.batch, self.device, self.on_host = batch, device, not device.is_cuda
@@ -263,19 +307,24 @@ class RestInverse:
             matrices.append(np.pad(body.inverse, ((0, padding), (0, padding))).ravel())
         on_surface = np.unique(layout.vert_nodes[layout.vert_count == 1, 0])
         on_surface = on_surface[unknown[on_surface] >= 0]
-        surface[on_surface] = np.arange(len(on_surface))
+        affine_node = affine_nodes(layout)
+        affine = np.full(count, -1)
+        affine[affine_node] = np.arange(len(affine_node))
+        touching = np.concatenate([on_surface, affine_node])
+        surface[touching] = np.arange(len(touching))
 
         parts = {"inverse": np.concatenate(matrices), "start": starts[:-1], "first": firsts[:-1], "width": widths}
-        numbers = {"unknown": unknown, "part": part, "surface": surface, "surface_node": on_surface}
+        numbers = {"unknown": unknown, "part": part, "surface": surface, "surface_node": touching}
+        numbers |= {"affine": affine, "affine_node": affine_node}
         self.rest = rest = filled(Rest, device, parts | numbers)
-        self.low_rank = LowRank(rest, batch, max_contacts, lanes, device)
+        self.low_rank = LowRank(rest, batch, room(batch) if max_contacts is None else max_contacts, lanes, device)
         self.x, self.y = self._vectors(int(firsts[-1]), int(firsts[-1]))
         views = [rest.inverse[int(s) : int(s) + w * w].reshape((1, w, w)) for s, w in zip(starts, widths, strict=False)]
         self.products = [
             Product(view, self.x, self.y, int(first), int(first), batch) for view, first in zip(views, firsts, strict=False)
         ]
         self._lay_out_patches([patch for body in bodies for patch in body.patches], count)
-        self.jacobi = BlockJacobi(layout, batch, lanes, device, eliminate=False)
+        self.jacobi = BlockJacobi(layout, batch, lanes, device)
 
     def _vectors(self, inputs: int, outputs: int) -> tuple[wp.array, wp.array]:
         """Padded inputs (B, inputs) and parts of outputs (parts, B, outputs) of a product."""
@@ -335,10 +384,14 @@ class RestInverse:
             self.to_interface.compute(running)
         inputs = [rest, inside, r, self.y_inside, small, self.jacobi.inverse, running]
         self._launch(gather_interface, r.shape, inputs, [self.x, z])
+        if self.jacobi.affine:
+            threads = self.jacobi.affine.threads
+            inputs = [self.jacobi.elimination, self.jacobi.inverse, small, r, running, threads]
+            wp.launch(eliminate_where_full, (self.batch, threads), inputs, [z], device=self.device, block_dim=BLOCK_THREADS)
         for product in self.products:
             product.compute(running)
-        self.low_rank.find_forces(self.y, running)
-        self._launch(scatter_interface, r.shape, [rest, inside, small, self.y, running], [z, self.x_back])
+        self.low_rank.find_forces(self.y, z, running)
+        self._launch(scatter_interface, r.shape, [rest, inside, small, r, self.y, running], [z, self.x_back])
         if self.patched:
             self.from_interface.compute(running)
             self._launch(scatter_inside, r.shape, [inside, self.y_inside, self.y_back, small, running], [z])

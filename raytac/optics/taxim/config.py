@@ -48,6 +48,15 @@ class Taxim(OpticsConfig[Any]):
 
             baked_table(spec, device=device)
 
+    def bake_renders(self, spec: SensorSpec) -> int:
+        from raytac.optics.taxim.bake.settings import BakeSettings
+        from raytac.optics.taxim.cache import table_folder
+
+        settings = BakeSettings()
+        folder = table_folder(spec, settings, 0, spec.camera.resolution)
+        is_there = self.calibration is not None or (folder is not None and folder.is_dir())
+        return 0 if is_there else settings.renders(spec.optics.shadows)
+
     def maker(self) -> Any:
         return import_module("raytac.optics.taxim.mode").TaximMode
 

@@ -9,13 +9,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.physics.rigid.placed_kernels import Pads
-
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 LAST = 3
 """Grid of a pad that gives the gel's height and normal at a place."""
-_LAST = wp.constant(wp.int32(LAST))
 _NAN = wp.constant(wp.float64(float("nan")))
 
 
@@ -36,19 +33,6 @@ class Rows:
     deepest: wp.array(dtype=wp.float64)
     force: wp.array2d(dtype=wp.float64)
     radius: wp.array2d(dtype=wp.float64)
-
-
-@wp.func
-def place_of_gap(pads: Pads, pad: wp.int32, x: wp.float64, y: wp.float64, depth: wp.float64, row: wp.int32, rows: Rows):
-    """Place and normal of the least gap of a body too sharp to have nodes of its own there."""
-    fx, fy = pads.first_x[pad, _LAST], pads.first_y[pad, _LAST]
-    i = wp.int32(wp.round((x - pads.lines[fx][0]) / (pads.lines[fx + 1][0] - pads.lines[fx][0])))
-    j = wp.int32(wp.round((y - pads.lines[fy][0]) / (pads.lines[fy + 1][0] - pads.lines[fy][0])))
-    p = pads.lines[fx + wp.clamp(i, 0, pads.nx[pad, _LAST] - 1)]
-    q = pads.lines[fy + wp.clamp(j, 0, pads.ny[pad, _LAST] - 1)]
-    rest = p[1] + p[2] * (x - p[0]) + q[1] + q[2] * (y - q[0])
-    rows.centre[row] = wp.vec3d(x, y, rest - depth)
-    rows.normal[row] = wp.normalize(wp.vec3d(-p[2], -q[2], wp.float64(1.0)))
 
 
 @wp.func

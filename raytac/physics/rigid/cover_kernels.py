@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.physics.rigid.law_kernels import Sums, add_node
+from raytac.physics.rigid.law_kernels import NODE, Sums, add_node
 from raytac.physics.rigid.node_kernels import total_of
 from raytac.physics.rigid.placed_kernels import Pads, Placed, across, entries_of, larger, smaller, under
 from raytac.physics.rigid.shape_kernels import BOX, CYLINDER, Shapes, infinity
@@ -197,19 +197,47 @@ def kinds_of(shapes: Shapes, placed: Placed, block: wp.int32) -> wp.vec2i:
 
 
 @wp.func
+def may_have_outline(
+    pads: Pads, lane: wp.int32, lanes: wp.int32, pad: wp.int32, level: wp.int32, window: wp.vec4i, gap: wp.array(dtype=wp.float64),
+    below: wp.float64, rise: wp.float64,
+) -> wp.bool:  # fmt: skip
+    """False if no outline runs through a window; arguments as of ``add_outline``."""
+    if rise > _GENTLE * pads.pitch[level]:
+        return True
+    i0, j0, nx, ny = window[0], window[1], window[2], window[3]
+    lower, upper = j0 > 0, j0 + ny < pads.ny[pad, level]
+    before, after = i0 > 0, i0 + nx < pads.nx[pad, level]
+    outer, k = wp.int32(0), wp.int32(lane)  # nodes that count and have a neighbour beyond the window
+    while k < nx:
+        if (lower and gap[k] < below) or (upper and gap[(ny - 1) * nx + k] < below):
+            outer += 1
+        k += lanes
+    k = wp.int32(lane)
+    while k < ny:
+        if (before and gap[k * nx] < below) or (after and gap[k * nx + nx - 1] < below):
+            outer += 1
+        k += lanes
+    return total_of(outer) > 0
+
+
+@wp.func
 def add_outline(
-    shapes: Shapes, pads: Pads, placed: Placed, block: wp.int32, lane: wp.int32, pad: wp.int32, level: wp.int32, window: wp.vec4i,
-    gap: wp.array(dtype=wp.float64), ends: wp.array(dtype=wp.vec2f), below: wp.float64, depth: wp.float64, inverse: wp.float64,
+    shapes: Shapes, pads: Pads, placed: Placed, block: wp.int32, lane: wp.int32, lanes: wp.int32, pad: wp.int32, level: wp.int32,
+    window: wp.vec4i, gap: wp.array(dtype=wp.float64), ends: wp.array(dtype=wp.vec2f), below: wp.float64, depth: wp.float64,
+    inverse: wp.float64, rise: wp.float64,
     # outputs
     sums: wp.array(dtype=Sums),
 ):  # fmt: skip
     """Add to the bins the excess of a window's nodes over a quarter of each of their cells.
 
     ``window``: first node along x and y and nodes along each, of a pad's grid. ``gap`` [m]: of each, which counts ``below`` one [m].
-    ``ends``: memory for one more node than there are along x and y. Others as of ``add_node``.
+    ``ends``: memory for one more node than there are along x and y. ``rise``: of the greatest gap over the least [m]. Others as of
+    ``add_node``.
     """
     kinds = kinds_of(shapes, placed, block)
     if kinds[0] == 1:
+        return
+    if not may_have_outline(pads, lane, lanes, pad, level, window, gap, below, rise):
         return
     i0, j0, nx, ny = window[0], window[1], window[2], window[3]
     last_x, last_y = pads.nx[pad, level] - 1, pads.ny[pad, level] - 1
@@ -288,9 +316,10 @@ def add_outline(
                         covered(shapes, placed, block, outline, i, j, corners, steep, share, inside) / wp.float64(inside)
                         - _QUARTER
                     )
+                    parts = wp.floor(NODE * more + _HALF)
                     for m in range(4):
                         if corners[m] < below:
                             x, y = i0 + i + wp.where(m == 1 or m == 2, 1, 0), j0 + j + m / 2
-                            add_node(sums, larger(corners[m] + depth, _0) * inverse, x, y, more, 0)
+                            add_node(sums, larger(corners[m] + depth, _0) * inverse, x, y, parts, 0)
             i += across()
         j += wp.block_dim() // across()

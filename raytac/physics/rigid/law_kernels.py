@@ -15,6 +15,7 @@ import warp as wp
 
 from raytac.physics.rigid.contacts import LAW_POINTS
 from raytac.physics.rigid.load_law import SMOOTH
+from raytac.physics.rigid.placed_kernels import larger, smaller
 from raytac.physics.rigid.punch_kernels import entry_of, flat_punch, punch_radius, radius_of, response_at
 from raytac.physics.rigid.regions import CROSSING, PER_CORNER, PER_SIDE
 
@@ -40,7 +41,7 @@ _GAP_UNIT = wp.constant(wp.float64(2.0**27))
 """Of a bin's sum of gaps, over the greatest gap: 6·10^4 nodes fit into a sum."""
 _SMOOTH = wp.constant(wp.float64(SMOOTH))
 _LEAST_STEP = wp.constant(wp.float64(1e-12))
-_NODE = wp.constant(wp.float64(1024.0))
+NODE = wp.constant(wp.float64(1024.0))
 """Parts of a node that are counted."""
 _1 = wp.constant(wp.float64(1.0))
 _2 = wp.constant(wp.float64(2.0))
@@ -113,15 +114,14 @@ def clear_bins(bins: Bins, block: wp.int32, lane: wp.int32, lanes: wp.int32):
 
 @wp.func
 def add_node(
-    sums: wp.array(dtype=Sums), share: wp.float64, i: wp.int32, j: wp.int32, weight: wp.float64, crossings: wp.int32
+    sums: wp.array(dtype=Sums), share: wp.float64, i: wp.int32, j: wp.int32, parts: wp.float64, crossings: wp.int32
 ):  # fmt: skip
     """Add node ``i``, ``j`` of a pad to the bins of a block, in any order.
 
-    ``share``: its gap at touch over the farthest that counts, in [0, 1). ``weight``: cells for which the node stands; what is added to
-    one node may be negative, and not their sum. ``crossings``: of ``crossings_at`` it, once.
+    ``share``: its gap at touch over the farthest that counts, in [0, 1). ``parts``: of a ``NODE``, for whose cells the node stands, a
+    whole number; what is added to one node may be negative, and not their sum. ``crossings``: of ``crossings_at`` it, once.
     """
     k = wp.min(wp.int32(wp.sqrt(share) * _SCALE), _BINS - 1)
-    parts = wp.floor(_NODE * weight + _HALF)
     x, y = wp.float64(i), wp.float64(j)
     px, py = parts * x, parts * y
     wp.atomic_add(
@@ -178,12 +178,12 @@ class Area:
 def widened(area: Area, sums: Sums, flat: wp.float64) -> Area:
     """A region and one more bin; ``flat``: spacing along y over that along x."""
     result = Area()
-    result.nodes = area.nodes + sums[0] / _NODE
-    result.x = area.x + sums[1] / _NODE
-    result.y = area.y + sums[2] / _NODE * flat
-    result.xx = area.xx + sums[3] / _NODE
-    result.xy = area.xy + sums[4] / _NODE * flat
-    result.yy = area.yy + sums[5] / _NODE * flat * flat
+    result.nodes = area.nodes + sums[0] / NODE
+    result.x = area.x + sums[1] / NODE
+    result.y = area.y + sums[2] / NODE * flat
+    result.xx = area.xx + sums[3] / NODE
+    result.xy = area.xy + sums[4] / NODE * flat
+    result.yy = area.yy + sums[5] / NODE * flat * flat
     result.crossings = area.crossings + sums[7]
     return result
 
@@ -198,28 +198,25 @@ def moments_of(area: Area, each: wp.float64, flat: wp.float64) -> wp.vec3d:
 
 
 @wp.func
-def punch_of(area: Area, flat: wp.float64, cell: wp.float64, law: wp.array2d(dtype=wp.float64), pad: wp.int32) -> wp.vec4d:
+def punch_of(area: Area, flat: wp.float64, cell: wp.float64, law: wp.array(dtype=wp.float64)) -> wp.vec4d:
     """``flat_punch`` of nodes of ``cell`` [m²] each; stiffness over the root of their number."""
     moments = cell / flat * moments_of(area, _1 / area.nodes, flat)
-    result = flat_punch(
-        area.nodes * cell, area.crossings * _CROSSING * wp.sqrt(cell), moments[0], moments[1], moments[2], law, pad
-    )
+    result = flat_punch(area.nodes * cell, area.crossings * _CROSSING * wp.sqrt(cell), moments[0], moments[1], moments[2], law)
     result[0] = result[0] / wp.sqrt(area.nodes)
     return result
 
 
 @wp.func
 def regions(
-    bins: Bins, block: wp.int32, deepest: wp.float64, flat: wp.float64, cell: wp.float64, law: wp.array2d(dtype=wp.float64),
-    pad: wp.int32,
+    bins: Bins, block: wp.int32, deepest: wp.float64, flat: wp.float64, cell: wp.float64, law: wp.array(dtype=wp.float64),
 ) -> wp.int32:  # fmt: skip
     """Write the regions that are the contact into ``bins.lines``, by depth; how many.
 
     Of a region the force is a straight line over the depth; the force of the contact is the envelope of all these lines.
     """
     # Half a node stands for a tip between nodes.
-    radius, response = radius_of(_HALF, cell), response_at(_0, law, pad)
-    tip = law[pad, 0] * radius * response_at(radius, law, pad)[0]
+    radius, response = radius_of(_HALF, cell), response_at(_0, law)
+    tip = law[0] * radius * response_at(radius, law)[0]
     bins.lines[block, 0] = wp.vec3d(tip, _0, _0)
     count = wp.int32(1)
     area, wider = Area(), Area()
@@ -228,7 +225,7 @@ def regions(
     gap_xx, gap_xy, gap_yy = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
     ranked, twice = wp.float64(0.0), wp.float64(0.0)
     punch = wp.vec4d(tip / wp.sqrt(_HALF), _1, _12 * response[1] - _6, response[2])
-    root_start = wp.float64(0.0)
+    root_start, of_gap = wp.float64(0.0), _HALF * deepest / _GAP_UNIT
     per_root = wp.vec4d()
     for k in range(_BINS):
         if k % _PUNCH == 0:
@@ -240,14 +237,14 @@ def regions(
             root_start = wp.sqrt(area.nodes)
             per_root = wp.vec4d()
             if wider.nodes > area.nodes:
-                per_root = (punch_of(wider, flat, cell, law, pad) - punch) / (wp.sqrt(wider.nodes) - root_start)
+                per_root = (punch_of(wider, flat, cell, law) - punch) / (wp.sqrt(wider.nodes) - root_start)
         sums = bins.sums[block, k] + Sums(_0)
         if sums[0] == _0:
             continue
         before = wp.float64(area.nodes + _0)
-        gap = sums[6] / (_GAP_UNIT * sums[0]) * _HALF * deepest
+        gap = sums[6] / sums[0] * of_gap
         area = widened(area, sums, flat)
-        weight = gap / _NODE
+        weight = gap / NODE
         gaps += weight * sums[0]
         square += gap * weight * sums[0]
         gap_x += weight * sums[1]
@@ -258,7 +255,7 @@ def regions(
         nodes = area.nodes
         ranked += gap * (nodes * nodes - before * before)
         twice += gap * (nodes * nodes * nodes - before * before * before)
-        each = _1 / nodes
+        each = _1 / nodes  # divisions take most of the time
         cx, cy, mean = area.x * each, area.y * each, gaps * each
         moments = moments_of(area, each, flat)
         xx, xy, yy = moments[0], moments[1], moments[2]
@@ -270,10 +267,10 @@ def regions(
         gy -= cy * mean
         inverse = _1 / (xx * yy - xy * xy)
         bowl = _QUARTER * (yy * gxx - _2 * xy * gxy + xx * gyy) * inverse - _HALF * mean
-        spread = _1 / wp.max(square * each - mean * mean, _LEAST_VARIANCE)
-        tilt = wp.max((yy * gx * gx - _2 * xy * gx * gy + xx * gy * gy) * inverse * spread, _0)
+        spread = _1 / larger(square * each - mean * mean, _LEAST_VARIANCE)
+        tilt = larger((yy * gx * gx - _2 * xy * gx * gy + xx * gy * gy) * inverse * spread, _0)
         round_share = _12 * bowl * bowl * spread
-        smooth = wp.min(tilt + round_share * round_share, _1)
+        smooth = smaller(tilt + round_share * round_share, _1)
         within = _QUARTER * (yy + flat * flat * xx) * inverse * bowl
         ranked_mean = ranked * each * each
         root = wp.sqrt(nodes)
@@ -285,7 +282,7 @@ def regions(
             + here[3] * (_2 * twice * each * each * each - _3 * ranked_mean + mean)
         )
         slope = here[0] * root
-        offset = slope * wp.max(mean, _0)
+        offset = slope * larger(mean, _0)
         last = bins.lines[block, count - 1] + wp.vec3d(_0)
         if slope <= last[0]:
             continue
@@ -323,24 +320,23 @@ def tabulate(
     deepest: wp.float64,
     flat: wp.float64,
     cell: wp.float64,
-    law: wp.array2d(dtype=wp.float64),
-    pad: wp.int32,
+    law: wp.array(dtype=wp.float64),
     row: wp.int32,
     # outputs
     force: wp.array2d(dtype=wp.float64),
     radius: wp.array2d(dtype=wp.float64),
 ):
     """Force and radius of a row at all depths of the table, one thread; ``flat``: ``add_node``."""
-    count = regions(bins, block, deepest, flat, cell, law, pad)
+    count = regions(bins, block, deepest, flat, cell, law)
     n, n_before, n_after, entry = wp.int32(0), wp.int32(0), wp.int32(0), wp.int32(0)
     for point in range(_POINTS):
         share = wp.float64(point) / _STEPS
         depth = deepest * share * share
-        step = wp.max(_SMOOTH * depth, _LEAST_STEP)
+        step = larger(_SMOOTH * depth, _LEAST_STEP)
         n = region_at(bins, block, count, n, depth)
         n_before = region_at(bins, block, count, n_before, depth - step)
         n_after = region_at(bins, block, count, n_after, depth + step)
         force[row, point] = force_at(bins, block, n, depth)
         slope = _HALF * (force_at(bins, block, n_after, depth + step) - force_at(bins, block, n_before, depth - step)) / step
-        entry = entry_of(slope, law, pad, entry)
-        radius[row, point] = punch_radius(slope, law, pad, entry)
+        entry = entry_of(slope, law, entry)
+        radius[row, point] = punch_radius(slope, law, entry)

@@ -117,7 +117,7 @@ def between_nodes(
         k += 1
     across = vertex_of(beside[0], middle, beside[1], pads.pitch[level])
     along = vertex_of(beside[2], middle, beside[3], pads.pitch[level])
-    return wp.vec3d(across[0] + along[0], beside[1], along[1])
+    return wp.vec3d(across[0] + along[0], across[1], along[1])
 
 
 @wp.func
@@ -157,41 +157,49 @@ def look_at_nodes(
 
 
 @wp.func
-def rises_at(gap: wp.array(dtype=wp.float64), k: wp.int32, step: wp.int32, at: wp.int32, count: wp.int32) -> wp.vec2d:
-    """Rises [m] from node k to those before and after on its line; inf where there is none.
+def rises_at(
+    gap: wp.array(dtype=wp.float64), k: wp.int32, step: wp.int32, at: wp.int32, count: wp.int32, here: wp.float64
+) -> wp.vec2d:  # fmt: skip
+    """Rises [m] from node k, with a gap ``here``, to those before and after on its line.
 
-    It is the ``at``-th of ``count`` nodes that are ``step`` apart in the window.
+    Inf where there is none. It is the ``at``-th of ``count`` nodes that are ``step`` apart in the window.
     """
     before, after = infinity(), infinity()
     if at > 0:
-        before = gap[k - step] - gap[k]
+        before = gap[k - step] - here
     if at < count - 1:
-        after = gap[k + step] - gap[k]
+        after = gap[k + step] - here
     return wp.vec2d(before, after)
 
 
 @wp.func
-def fall_along(
-    gap: wp.array(dtype=wp.float64), k: wp.int32, step: wp.int32, at: wp.int32, count: wp.int32, rises: wp.vec2d, steep: wp.float64
-) -> wp.vec2d:  # fmt: skip
-    """Greatest fall [m] of a convex gap within a spacing of node k, by ``rises_at`` it.
-
-    Also for how many spacings around the node this must hold: 0.5, 1 beside the outline of body or window, 2 at the body's outline, which
-    may end in a tip that has no node on the next line.
+def fall_of(rises: wp.vec2d, steep: wp.float64) -> wp.float64:
+    """Greatest fall [m] of a convex gap within a spacing of a node, by its ``rises_at``.
 
     A convex function falls on one side of a node by no more than it rises on the other. A neighbour that is higher by more than ``steep``
     bounds nothing. It counts as one beyond the outline: the node on the other side bounds what is between.
+    """
+    low, high = smaller(rises[0], rises[1]), larger(rises[0], rises[1])
+    if high > steep and (low <= steep or high == _INF):
+        high = wp.where(low < _INF, low, steep)
+    return larger(high, _0)
+
+
+@wp.func
+def spacings_around(
+    gap: wp.array(dtype=wp.float64), k: wp.int32, step: wp.int32, at: wp.int32, count: wp.int32, rises: wp.vec2d, steep: wp.float64
+) -> wp.float64:  # fmt: skip
+    """For how many spacings around node k ``fall_of`` must hold; arguments as of ``rises_at``.
+
+    0.5, 1 beside the outline of body or window, 2 at the body's outline, which may end in a tip that has no node on the next line.
     """
     low, high, around = smaller(rises[0], rises[1]), larger(rises[0], rises[1]), wp.float64(1.0)
     if at > 1 and at < count - 2:
         if gap[k - 2 * step] - gap[k - step] <= steep and gap[k + 2 * step] - gap[k + step] <= steep:
             around = _HALF
-    if high > steep:
-        if at > 0 and at < count - 1 and (high == _INF or low <= steep):
-            around = _2
-        if low <= steep or high == _INF:
-            high = wp.where(low < _INF, low, steep)
-    return wp.vec2d(larger(high, _0), around)
+    if high > steep and at > 0 and at < count - 1 and (high == _INF or low <= steep):
+        around = _2
+    return around
 
 
 @wp.func
@@ -242,22 +250,28 @@ def nodes_below(
         i = lane % across()
         while i < nx:
             k = j * nx + i
-            room = below - gap[k]
+            here = gap[k] + _0
+            room = below - here
             if room > -_INF:
-                p, q = rises_at(gap, k, 1, i, nx), rises_at(gap, k, nx, j, ny)
-                rise_x, rise_y = larger(p[0], p[1]), larger(q[0], q[1])
+                p, q = rises_at(gap, k, 1, i, nx, here), rises_at(gap, k, nx, j, ny, here)
+                highest, fall_x, fall_y = larger(larger(p[0], p[1]), larger(q[0], q[1])), fall_of(p, steep), fall_of(q, steep)
                 # A node amid others that are below tells nothing of where they end.
-                if larger(rise_x, rise_y) > room and room + rise_x + rise_y >= _0:
-                    along_x, along_y = fall_along(gap, k, 1, i, nx, p, steep), fall_along(gap, k, nx, j, ny, q, steep)
-                    around = larger(along_x[1], along_y[1])
+                if highest > room and room + fall_x + fall_y >= _0:
+                    around = larger(spacings_around(gap, k, 1, i, nx, p, steep), spacings_around(gap, k, nx, j, ny, q, steep))
                     within = smaller(around, _1)
-                    room_x, room_y = room + within * along_y[0], room + within * along_x[0]
+                    room_x, room_y = room + within * fall_y, room + within * fall_x
                     bound = below + room - room_x - room_y
                     least = smaller(least, bound)
                     if bound <= below:
-                        x = wp.float64(i)
-                        x0, x1 = smaller(x0, x - extent(room_x, p[1], around)), larger(x1, x + extent(room_x, p[0], around))
-                        y0, y1 = smaller(y0, y - extent(room_y, q[1], around)), larger(y1, y + extent(room_y, q[0], around))
+                        x = wp.float64(i)  # an extent is at most ``around``, and takes a division
+                        if x - around < x0:
+                            x0 = smaller(x0, x - extent(room_x, p[1], around))
+                        if x + around > x1:
+                            x1 = larger(x1, x + extent(room_x, p[0], around))
+                        if y - around < y0:
+                            y0 = smaller(y0, y - extent(room_y, q[1], around))
+                        if y + around > y1:
+                            y1 = larger(y1, y + extent(room_y, q[0], around))
             i += across()
         j += wp.block_dim() // across()
     return least_of(least), wp.vec4d(least_of(x0), -least_of(-x1), least_of(y0), -least_of(-y1))
@@ -270,6 +284,27 @@ def box_around(
     """x from, to, y from, to [m] of spacings from node ``i0``, ``j0`` of a grid."""
     x, y = pads.lines[fx][0] + wp.float64(i0) * step_x, pads.lines[fy][0] + wp.float64(j0) * step_y
     return wp.vec4d(x + box[0] * step_x, x + box[1] * step_x, y + box[2] * step_y, y + box[3] * step_y)
+
+
+@wp.func
+def nodes_in(
+    pads: Pads, placed: Placed, block: wp.int32, pad: wp.int32, level: wp.int32, below: wp.float64, box: wp.vec4d
+) -> wp.vec4i:
+    """First node and number of nodes along x and y of the ``window`` within a box [m].
+
+    ``box``: x from, to, y from, to; with one node beyond, for the law to know the node after the last that counts. From −inf: all.
+    """
+    area = window(pads, placed, block, pad, level, below)
+    i0, i1, j0, j1 = area[0], area[1], area[2], area[3]
+    if box[0] > -_INF:
+        fx, fy = pads.first_x[pad, level], pads.first_y[pad, level]
+        x0, y0 = pads.lines[fx][0], pads.lines[fy][0]
+        step_x, step_y = pads.lines[fx + 1][0] - x0, pads.lines[fy + 1][0] - y0
+        i0 = wp.max(i0, wp.int32(wp.floor((box[0] - x0) / step_x)))
+        i1 = wp.min(i1, wp.int32(wp.ceil((box[1] - x0) / step_x)) + 1)
+        j0 = wp.max(j0, wp.int32(wp.floor((box[2] - y0) / step_y)))
+        j1 = wp.min(j1, wp.int32(wp.ceil((box[3] - y0) / step_y)) + 1)
+    return wp.vec4i(i0, j0, wp.max(i1 - i0, 0), wp.max(j1 - j0, 0))
 
 
 @wp.func

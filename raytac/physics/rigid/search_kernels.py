@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.physics.rigid.contact_rows import LAST, Rows, missing_row, place_of_gap
-from raytac.physics.rigid.cover_kernels import add_outline
-from raytac.physics.rigid.law_kernels import DEEPER, Bins, add_node, clear_bins, crossings_at, deepest_of, most_deepest, tabulate
+from raytac.physics.rigid.contact_rows import LAST, Rows, missing_row
+from raytac.physics.rigid.law_kernels import DEEPER, Bins, most_deepest
 from raytac.physics.rigid.motion_kernels import is_finite
 from raytac.physics.rigid.node_kernels import (
     between_nodes,
@@ -24,22 +23,13 @@ from raytac.physics.rigid.node_kernels import (
     least_of,
     look_at_nodes,
     nodes_below,
+    nodes_in,
     nodes_near,
     pierced_at,
     total_of,
 )
-from raytac.physics.rigid.placed_kernels import (
-    Pads,
-    Placed,
-    across,
-    bottom_of,
-    larger,
-    lowest_of,
-    place_parts,
-    under_nodes,
-    width_of,
-    window,
-)
+from raytac.physics.rigid.overlap_kernels import Touch, Window, fill_row, touch_at
+from raytac.physics.rigid.placed_kernels import Pads, Placed, bottom_of, lowest_of, place_parts, under_nodes, width_of
 from raytac.physics.rigid.shape_kernels import Shapes, infinity
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -63,8 +53,6 @@ _NEAR = wp.constant(wp.float64(0.75))
 A cone of 45° would reach 0.71 further."""
 _CLOSE = wp.constant(wp.float64(1e-6))
 """Tolerance of a least gap [m] against its lower bound; parabolas come nearer by far."""
-_JUST_TOUCHING = wp.constant(wp.float64(50e-6))
-"""Added depth [m] whose overlap's centroid is the place of a gap."""
 _0 = wp.constant(wp.float64(0.0))
 _1 = wp.constant(wp.float64(1.0))
 _2 = wp.constant(wp.float64(2.0))
@@ -115,11 +103,24 @@ def find_near(
 
 
 @wp.func
+def next_level(level: wp.int32, last: wp.int32, count: wp.int32) -> wp.int32:
+    """The next grid, on which there may be enough nodes if there are so many on this one.
+
+    With half the spacing there are four times as many: a grid with fewer than half of enough is left out.
+    """
+    following, expected = level + 1, 4 * count
+    while following < wp.min(last, _LAST) and expected < _ENOUGH // 2:
+        following += 1
+        expected *= 4
+    return following
+
+
+@wp.func
 def measure_pair(
     pose: wp.mat44d, reach: wp.float64, shapes: Shapes, pads: Pads, work: Work, block: wp.int32, lane: wp.int32, lanes: wp.int32,
     pad: wp.int32, body: wp.int32, row: wp.int32, rows: Rows,
 ):  # fmt: skip
-    """Fill one row."""
+    """Fill one row: find depth and place, then a grid with enough nodes for the law."""
     placed, gaps = work.placed, work.gap[block]
     place_parts(shapes, pads, placed, block, lane, lanes, pose, pad, body, reach)
     total_of(_0)
@@ -137,15 +138,14 @@ def measure_pair(
         lowest = pierced_at(shapes, pads, placed, block, lane, lanes, pad, _LAST)
     pierced = lowest < _INF
 
-    mode, level, touching = wp.int32(_SEARCH), wp.int32(_FIRST), wp.int32(0)
+    mode, level = wp.int32(_SEARCH), wp.int32(_FIRST)
     if convex and pads.pitch[0] <= _HALF * wp.min(width[0], width[1]):
         level = 0
     everywhere = wp.vec4d(-_INF, _INF, -_INF, _INF)  # x from, to, y from, to
     outer, box = wp.vec4d(everywhere), wp.vec4d(everywhere)  # where the gap may be below ``clear``; where nodes are looked at
     zero = wp.float64(0.0)  # gap below which nodes count
     low, low_level, low_i, low_j = infinity(), wp.int32(0), wp.int32(0), wp.int32(0)  # lowest node of the body, on any grid
-    depth, deepest, least = wp.float64(0.0), wp.float64(0.0), infinity()
-    refined_x, refined_y = wp.float64(0.0), wp.float64(0.0)
+    touch, least = Touch(), infinity()
     i0, j0, nx, ny = wp.int32(0), wp.int32(0), wp.int32(0), wp.int32(0)
     fx, fy = wp.int32(0), wp.int32(0)
     may_zoom, busy = wp.int32(1), wp.int32(1)
@@ -153,19 +153,12 @@ def measure_pair(
         pitch = pads.pitch[level]
         wide = pitch <= _HALF * wp.min(width[0], width[1])  # so that nothing of the body fits between nodes
         near = wp.where(level < last, _NEAR * pitch, _0)
-        area = window(pads, placed, block, pad, level, highest + wp.max(zero, wp.max(near, clear)))
+        below = highest + wp.max(zero, wp.max(near, clear))
+        nodes = nodes_in(pads, placed, block, pad, level, below, box)
         fx, fy = wp.int32(pads.first_x[pad, level]), wp.int32(pads.first_y[pad, level])
         step_x = pads.lines[fx + 1][0] - pads.lines[fx][0]
         step_y = pads.lines[fy + 1][0] - pads.lines[fy][0]
-        x0, y0 = pads.lines[fx][0], pads.lines[fy][0]
-        i0, j0 = area[0], area[2]
-        i1, j1 = area[1], area[3]
-        if box[0] > -_INF:  # and one node beyond, for the law to know the node after the last that counts
-            i0 = wp.max(i0, wp.int32(wp.floor((box[0] - x0) / step_x)))
-            i1 = wp.min(i1, wp.int32(wp.ceil((box[1] - x0) / step_x)) + 1)
-            j0 = wp.max(j0, wp.int32(wp.floor((box[2] - y0) / step_y)))
-            j1 = wp.min(j1, wp.int32(wp.ceil((box[3] - y0) / step_y)) + 1)
-        nx, ny = wp.max(i1 - i0, 0), wp.max(j1 - j0, 0)
+        i0, j0, nx, ny = nodes[0], nodes[1], nodes[2], nodes[3]
         if level < last and nx * ny < _ENOUGH and not (mode == _ZOOM and convex):  # so few cannot be enough
             level += 1
             continue
@@ -223,13 +216,10 @@ def measure_pair(
                 mode = wp.int32(_ZOOM)
                 box = box_around(pads, fx, fy, i0 + i, j0 + j, wp.vec4d(-_1, _1, -_1, _1), step_x, step_y)
         if not done:
-            level += 1
-            if mode != _ZOOM:
-                # With half the spacing there are four times as many nodes: a grid with fewer than half of enough is left out.
-                expected = 4 * count
-                while level < wp.min(last, _LAST) and expected < _ENOUGH // 2:
-                    level += 1
-                    expected *= 4
+            if mode == _ZOOM:
+                level += 1
+            else:
+                level = next_level(level, last, count)
                 if wide and not convex and width[1] == _INF:
                     around = nodes_near(gaps, lane, nx, ny, _NEAR * pitch + clear)
                     if around[0] < _INF:
@@ -244,93 +234,34 @@ def measure_pair(
         if beyond or least == _INF:
             least = _INF
             continue
-        drop = between_nodes(shapes, pads, placed, block, pad, level, i0 + i, j0 + j, least, 1)
-        depth = drop[0] - least
-        refined_x = pads.lines[fx + i0 + i][0] + drop[1] * step_x
-        refined_y = pads.lines[fy + j0 + j][0] + drop[2] * step_y
-        deepest = deepest_of(depth, reach, work.ahead, thickness)
-        if least < _0:
-            touching = 1
+        touch = touch_at(shapes, pads, placed, block, pad, level, i0 + i, j0 + j, least, reach, work.ahead)
+        if touch.touching:
             level += 1  # as after the law's nodes
-        elif -depth >= reach:
+        elif -touch.depth >= reach:
             least = _INF
         else:
             mode, level, busy = wp.int32(_LAW), wp.int32(_FIRST), wp.int32(1)
-            zero = _HALF * deepest - depth
+            zero = _HALF * touch.deepest - touch.depth
             box = wp.vec4d(outer)
     level -= 1
 
     if least == _INF:
+        total_of(_0)  # a thread that goes on to the next pair places its parts where others still look at this one's
         if lane == 0:
             rows.valid[row] = 0
             if pierced:
                 missing_row(rows, row, thickness + bond - lowest, lowest - bond)
         return
 
-    # Moments of the overlap, or of that which a near body would have a little deeper.
-    shift = wp.float64(0.0)
-    if touching == 0:
-        shift = wp.min(_HALF * deepest, _JUST_TOUCHING) - depth
-    s, szz, su, sv = wp.float64(0.0), wp.float64(0.0), wp.vec3d(), wp.vec3d()
-    first, second = wp.vec3d(), wp.vec3d()  # number of nodes and first moments, second moments of the overlap's area
-    clear_bins(work.bins, block, lane, lanes)
-    total_of(_0)
-    last_x, last_y = pads.nx[pad, level] - 1, pads.ny[pad, level] - 1
-    flat, below, sums = step_y / step_x, _HALF * deepest - depth, work.bins.sums[block]
-    inverse = _1 / (_HALF * deepest)
-    j = lane // across()
-    while j < ny:
-        v = pads.lines[fy + j0 + j] + wp.vec3d()
-        cells = wp.where(j0 + j == 0 or j0 + j == last_y, _HALF, _1)  # a node on an edge of the pad stands for half of one
-        row_s, row_n, row_x, row_xx = wp.float64(0.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0)
-        i = lane % across()
-        while i < nx:
-            gap = gaps[j * nx + i] + _0
-            overlap = shift - gap
-            if overlap > _0:
-                u = pads.lines[fx + i0 + i] + wp.vec3d()
-                row_s += overlap
-                szz += overlap * overlap
-                su += overlap * u
-                row_n += wp.float64(1.0)
-                row_x += u[0]
-                row_xx += u[0] * u[0]
-            if gap < below:
-                weight = wp.where(i0 + i == 0 or i0 + i == last_x, _HALF * cells, cells)
-                crossings = crossings_at(gaps, i, j, nx, ny)
-                add_node(sums, larger(gap + depth, _0) * inverse, i0 + i, j0 + j, weight, crossings)
-            i += across()
-        s += row_s
-        sv += row_s * v
-        first += wp.vec3d(row_n, row_x, row_n * v[0])
-        second += wp.vec3d(row_xx, row_x * v[0], row_n * v[0] * v[0])
-        j += wp.block_dim() // across()
-    area = wp.vec4i(i0, j0, nx, ny)
-    add_outline(shapes, pads, placed, block, lane, pad, level, area, gaps, work.ends[block], below, depth, inverse, sums)
-    s, szz = total_of(s), total_of(szz)
-    sx, sz, slope_x = total_of(su[0]), total_of(su[1] + sv[1]), total_of(su[2])
-    sy, slope_y = total_of(sv[0]), total_of(sv[2])
-    n1, nx1, ny1 = total_of(first[0]), total_of(first[1]), total_of(first[2])
-    nxx, nxy, nyy = total_of(second[0]), total_of(second[1]), total_of(second[2])
-    if lane == 0:
-        rows.valid[row] = 1
-        rows.depth[row] = depth
-        rows.deepest[row] = deepest
-        rows.clearance[row] = lowest - bond
-        rows.spread[row] = wp.vec3d(_0, _0, _0)
-        if touching == 1 and s > _0:
-            x, y = sx / s, sy / s
-            rows.spread[row] = wp.vec3d(
-                (nxx - _2 * x * nx1 + n1 * x * x) / s,
-                (nxy - x * ny1 - y * nx1 + n1 * x * y) / s,
-                (nyy - _2 * y * ny1 + n1 * y * y) / s,
-            )
-        if s > _0:
-            rows.centre[row] = wp.vec3d(sx / s, sy / s, sz / s - szz / s + shift)
-            rows.normal[row] = wp.normalize(wp.vec3d(-slope_x / s, -slope_y / s, wp.float64(1.0)))
-        else:
-            place_of_gap(pads, pad, refined_x, refined_y, depth, row, rows)
-        tabulate(work.bins, block, deepest, flat, pads.cell[pad, level], pads.law, pad, row, rows.force, rows.radius)
+    touch.lowest = lowest
+    touch.least = least_of(own_least)
+    area = Window()
+    area.level = level
+    area.x = i0
+    area.y = j0
+    area.nx = nx
+    area.ny = ny
+    fill_row(shapes, pads, placed, work.bins, gaps, work.ends[block], block, lane, lanes, pad, area, touch, row, rows)
 
 
 @wp.kernel

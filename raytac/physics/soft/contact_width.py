@@ -53,7 +53,7 @@ def warn_if_narrow(cells: np.ndarray, level: object, *, stacklevel: int) -> bool
     if not least < LEAST_CELLS:
         return False
     level = level if isinstance(level, str) else "own"
-    finer = PADS[-1:] if level in PADS[:-1] else ()  # medium, without volume blocks, is stiffer than coarse
+    finer = PADS[PADS.index(level) + 1 :] if level in PADS else ()
     remedy = f"choose level={finer[0]!r}" if finer else "no level is finer: give a finer mesh of your own as level"
     where = f" in environment {int(np.nanargmin(cells))}" if len(cells) > 1 else ""
     warnings.warn(

@@ -39,7 +39,7 @@ class PadLevel:
 
 PAD_LEVELS = {
     "coarse": PadLevel(1.6e-3, 3, 6.0, 3.0, 5e-5, (2, 2, 1)),
-    "medium": PadLevel(0.85e-3, 5, 2.5, 2.5, 3e-5),
+    "medium": PadLevel(0.85e-3, 5, 2.5, 2.5, 3e-5, (2, 2, 1), 1.0),
     "fine": PadLevel(0.5e-3, 8, 2.5, 3.0, 1.5e-5),
 }
 """Named levels; docs/measurements/soft-pad.md has the errors of each."""

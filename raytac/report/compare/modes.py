@@ -12,6 +12,7 @@ from raytac.gel.surface import GelSurface
 from raytac.optics.base import Variant
 from raytac.optics.registry import OPTICS
 from raytac.report.tracers import Tracers
+from raytac.specs.sensor import SensorSpec
 
 if TYPE_CHECKING:
     from raytac.optics.base import OpticalMode, OpticsImages
@@ -48,6 +49,8 @@ class Mode:
     """Settings as they go into the key of a row."""
     prepare: Callable[[Setting], object] | None = None
     """Untimed work whose result stays on disk for later processes, such as baking a table."""
+    prepare_renders: Callable[[SensorSpec], int] = lambda _: 0
+    """Images of the sensor's own size that ``prepare`` would render."""
     has_reference: bool = True
     """True if the image shows our sensor, so that an error against our reference is defined."""
     note: str = ""
@@ -121,6 +124,7 @@ def _mode(variant: Variant, spp: int | None, *, left_out: bool) -> Mode:
         unbiased=config.unbiased,
         options=repr(config),
         prepare=None if left_out else bake,
+        prepare_renders=(lambda _: 0) if left_out else config.bake_renders,
         note=variant.note,
     )
 

@@ -29,7 +29,7 @@ from raytac.report.compare.marker_error import PAD as MARKER_PAD
 from raytac.report.compare.marker_error import MarkerErrors, marker_errors
 from raytac.report.compare.modes import Mode, Setting, chosen_modes, comparison_modes
 from raytac.report.compare.physics_error import PhysicsError, physics_errors
-from raytac.report.compare.settings import CompareSettings, expected_seconds
+from raytac.report.compare.settings import CompareSettings, expected_bake_seconds, expected_seconds
 from raytac.report.compare.store import References, Row, RowStore, Value, row_key
 from raytac.report.image_error import METRICS, has_flip, image_errors, psnr, rmse
 from raytac.report.image_error import mae as mean_absolute
@@ -183,14 +183,22 @@ class _Run:
             tracer = self._tracers.get(size, RayTraced("reference"))
             path_trace(tracer, surface, 1, 0)  # compiles
             sample_s = 1e-3 * once(lambda seed: path_trace(tracer, surface, 4, seed), 1) / 4
-            seconds = expected_seconds(settings, modes, sample_s)
+            bake_s = expected_bake_seconds(spec, modes, self._frame_seconds)
+            seconds = expected_seconds(settings, modes, sample_s, bake_s)
             LOG.info(
-                "about %s for %d scenes and %d modes, if nothing is kept from before; %s/report.html grows after each scene",
+                "about %s for %d scenes and %d modes, if nothing is kept from before%s; %s/report.html grows after each scene",
                 Progress.format_interval(seconds),
                 len(settings.scenes) * len(settings.resolutions),
                 len(modes),
+                f", of which {Progress.format_interval(bake_s)} bake a table, once" if bake_s else "",
                 self.folder.parent,
             )
+
+    def _frame_seconds(self) -> float:
+        """Time of a frame of ``fast`` of the sensor's own size [s]."""
+        fast, surface = self._tracers.get(self._tracers.spec.camera.resolution), next(iter(self._surfaces.values()))
+        fast.render(surface)  # compiles
+        return 1e-3 * once(fast.render, surface)
 
     @property
     def _name(self) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from raytac.markers.base import marker_motion_of
 from raytac.report.compare.modes import Mode, chosen_modes, comparison_modes
 from raytac.report.image_error import SSIM_BORDER
 from raytac.sensor import LARGEST_SIDE
-from raytac.specs import PADS, load_press, load_sensor, validate_press
+from raytac.specs import PADS, SensorSpec, load_press, load_sensor, validate_press
 
 MODES = ("fast", "taxim", "taxim_shadow", "phong", "reference", "path")
 """Modes of a comparison in minutes; ``full`` adds variants, denoiser, networks and peer."""
@@ -26,6 +26,8 @@ _RENDERS = 9
 """Renders for a row of a sampled mode: image, warm-up, timings, memory; some are slower."""
 _TIMINGS, _FRAME_S, _BUILD_S = 2.5, 0.1, 3.0
 """Timings of a row, time of a frame and of building a mode [s], for an estimate."""
+_BAKED = 1.7
+"""Time of an image in a bake, with its fit, over that of a frame of ``fast``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,11 +111,12 @@ class CompareSettings:
             raise BackendError(f"the report needs {', '.join(missing)}: `pip install 'raytac[report]'`")
 
 
-def expected_seconds(settings: CompareSettings, modes: Sequence[Mode], sample_s: float) -> float:
-    """Estimated time of a comparison of which nothing is kept [s].
+def expected_seconds(settings: CompareSettings, modes: Sequence[Mode], sample_s: float, bake_s: float = 0.0) -> float:
+    """Estimated time of a comparison of which no row is kept [s].
 
-    ``sample_s``: measured time of one sample a pixel of the reference at the first resolution [s]. Tables that have to be baked are not
-    in it.
+    Args:
+        sample_s: measured time of one sample a pixel of the reference at the first resolution [s].
+        bake_s: that of ``expected_bake_seconds``.
     """
     width, height = settings.resolutions[0]
     share = sum(w * h for w, h in settings.resolutions) / (width * height)
@@ -121,4 +124,13 @@ def expected_seconds(settings: CompareSettings, modes: Sequence[Mode], sample_s:
     for mode in modes:
         renders = _RENDERS * (mode.spp or 0) * sample_s
         scene += renders if mode.spp is not None else min(_TIMINGS * settings.budget_s, settings.frames * _FRAME_S)
-    return len(settings.scenes) * share * scene + _BUILD_S * len(modes) * len(settings.resolutions)
+    return bake_s + len(settings.scenes) * share * scene + _BUILD_S * len(modes) * len(settings.resolutions)
+
+
+def expected_bake_seconds(spec: SensorSpec, modes: Sequence[Mode], frame_s: Callable[[], float]) -> float:
+    """Estimated time of the tables that have to be baked first [s].
+
+    ``frame_s`` measures a frame of ``fast`` of the sensor's own size [s]; it is called if there is something to bake. Modes share a table.
+    """
+    renders = max((mode.prepare_renders(spec) for mode in modes), default=0)
+    return renders * _BAKED * frame_s() if renders else 0.0

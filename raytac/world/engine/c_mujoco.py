@@ -19,7 +19,7 @@ from raytac.errors import InputError
 from raytac.physics.rigid.gel_contact import GelContact, HostViews
 from raytac.physics.rigid.world_kernels import ROWS
 from raytac.robots.mujoco_memory import checked_layouts, same_states
-from raytac.robots.states import StateReader, body_pose, site_pose
+from raytac.robots.states import StateReader, body_pose, numbers, site_pose
 from raytac.warp_runtime import Recorded
 from raytac.world.engine.c_kernels import (
     Memory,
@@ -73,7 +73,7 @@ class CMujoco:
         self._address, self._sparse = np.zeros(num_envs, np.uint64), np.zeros(1, np.int32)
         self._datas: list[mujoco.MjData] = []
         self._models: list[mujoco.MjModel] = []
-        self._poses: StateReader | None = None
+        self._reader: StateReader | None = None
         self._options: list[Any] = []
         memory: Any = Memory()
         memory.states = wp.array(self._address, dtype=wp.uint64, device="cpu", copy=False)
@@ -114,7 +114,7 @@ class CMujoco:
         if not same_states(datas, self._datas):
             self._datas = list(datas)
             self._address[:] = [data._address for data in datas]
-            self._poses = None
+            self._reader = None
 
     def prepare(self) -> None:
         """Take over models that were replaced.
@@ -130,17 +130,19 @@ class CMujoco:
         if options.timestep != self._timestep:
             rule = f"must stay {self._timestep!r} s, with which the pads were made"
             raise InputError("model.opt.timestep", value=options.timestep, rule=rule)
-        if options.cone != mujoco.mjtCone.mjCONE_ELLIPTIC:
+        if options.cone != _ELLIPTIC:
             raise InputError("model.opt.cone", value="pyramidal", rule="must stay elliptic, since a gel sticks by its shear")
 
     def invalid(self) -> np.ndarray:
         """As of ``Engine``."""
-        return lost(self._datas)
+        now = self._read()
+        return lost(now["speed"], now["position"])
 
     def begin_step(self) -> None:
         """``mj_step1``."""
+        models, datas = self._models, self._datas
         for b in self._envs():
-            mujoco.mj_step1(self._models[b], self._datas[b])
+            mujoco.mj_step1(models[b], datas[b])
 
     def counts(self, envs: Sequence[int] | np.ndarray) -> list[tuple[int, int]]:
         """Contacts and rows that MuJoCo has, of each environment."""
@@ -148,9 +150,10 @@ class CMujoco:
 
     def free_acceleration(self) -> None:
         """As of ``Engine``; ``mj_step2`` gives the same."""
+        models, datas = self._models, self._datas
         for b in self._envs():
-            mujoco.mj_fwdActuation(self._models[b], self._datas[b])
-            mujoco.mj_fwdAcceleration(self._models[b], self._datas[b])
+            mujoco.mj_fwdActuation(models[b], datas[b])
+            mujoco.mj_fwdAcceleration(models[b], datas[b])
 
     def update_poses(self) -> None:
         """``mj_kinematics``."""
@@ -159,11 +162,16 @@ class CMujoco:
 
     def read_poses(self) -> tuple[np.ndarray, np.ndarray]:
         """``world_from_pad`` and ``world_from_body`` of the last step or ``update_poses``."""
-        if self._poses is None:
-            members = {"pads": site_pose(self._pads.sites), "bodies": body_pose(self._pads.bodies)}
-            self._poses = StateReader(self._datas, members)
-        poses = self._poses.values()
-        return poses["pads"], poses["bodies"]
+        now = self._read()
+        return now["pads"], now["bodies"]
+
+    def _read(self) -> dict[str, np.ndarray]:
+        """Poses, ``speed`` qvel and ``position`` qpos of all states."""
+        if self._reader is None:
+            speed, position = (numbers(name, np.arange(getattr(self._datas[0], name).size)) for name in ("qvel", "qpos"))
+            poses = {"pads": site_pose(self._pads.sites), "bodies": body_pose(self._pads.bodies)}
+            self._reader = StateReader(self._datas, {**poses, "speed": speed, "position": position})
+        return self._reader.values()
 
     def _envs(self) -> list[int]:
         """Environments of this step."""
@@ -231,20 +239,23 @@ class CMujoco:
 
         Afterwards the models have their timestep again.
         """
-        envs, timestep = self._envs(), self._timestep
+        envs, timestep, damping = self._envs(), self._timestep, self._damping
         models, datas, options, views = self._models, self._datas, self._options, self._views
         lengths, lost = views.length[: len(envs)].tolist(), views.lost[: len(envs)].tolist()
         for row, b in enumerate(envs):
             if lost[row]:
                 continue
-            options[b].timestep = lengths[row]
+            is_shorter = lengths[row] != timestep
+            if is_shorter:
+                options[b].timestep = lengths[row]
             try:
-                if not self._damping.step(b, models[b], datas[b]):
+                if not (damping.matters and damping.step(b, models[b], datas[b])):
                     mujoco.mj_step2(models[b], datas[b])
             except mujoco.FatalError:
                 self._lose(b, row)
             finally:
-                options[b].timestep = timestep
+                if is_shorter:
+                    options[b].timestep = timestep
 
     def _lose(self, env: int, row: int) -> None:
         if self._views.lost[row]:
@@ -254,6 +265,7 @@ class CMujoco:
         warnings.warn(f"environment {env} failed: {rule}", RuntimeWarning, stacklevel=2)
 
 
+_ELLIPTIC = int(mujoco.mjtCone.mjCONE_ELLIPTIC)
 _SOLVES = 20
 """Solves of MuJoCo's at most for the lift of a slide that begins or ends."""
 

@@ -141,7 +141,7 @@ class Mechanics:
         rise, self._energy = energy - self._energy - max(stored, self._stored), energy
         self._stored = stored
         self._kinetic = max(self._kinetic, float(report.kinetic[0]))
-        if not report.converged[0]:
+        if not report.converged[0] or report.halved[0]:  # of a step in halves the forces are those of its last part
             return
         for name in self._free:
             forces, mass = self._world.contact_forces(name)[0], self._motion[name].mass

@@ -71,6 +71,8 @@ class Problem:
         self.contacts.row_verts = self._array(self._repeat(verts), wp.vec4i)
         self.contacts.row = self._array(self._repeat(rows), mat34d)
         self.contacts.row_count = self._array(np.full(batch, len(rows)), wp.int32)
+        self.contacts.concave = self._array(np.zeros((batch, len(rows))), wp.int32)
+        s.project = self.mask(0)
 
     def _array(self, values: np.ndarray, dtype: type) -> wp.array:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)

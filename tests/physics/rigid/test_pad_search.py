@@ -228,6 +228,19 @@ def test_a_gap_is_as_wide_as_it_is_and_has_the_law_of_the_contact_to_come(gap: f
     assert not len(search_one(FLAT, ball, ball_over(3.33e-3, gap)[None], reach=0.99 * gap).env)
 
 
+def test_a_gap_between_nodes_has_its_place_along_both_axes() -> None:
+    """A mesh of a ball so small that no node is near enough for the law, which counts gaps 15 µm greater than the least."""
+    sphere = trimesh.creation.icosphere(4, 0.5e-3)
+    x, y = (
+        np.linspace(-0.5 * size, 0.5 * size, round(size / 0.2e-3) + 1)[40] + np.array([0.1e-3, 0.08e-3]) for size in FLAT.size
+    )
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, :3, 3] = np.stack([x, y[::-1], np.full(2, 0.52e-3)], axis=1)
+    found = search_one(FLAT, [mesh_part(sphere.vertices, sphere.faces)], poses)
+    np.testing.assert_allclose(found.depth, -20e-6, atol=3e-6)
+    np.testing.assert_allclose(found.centre[:, :2], poses[:, :2, 3], atol=10e-6)
+
+
 def test_what_is_beside_above_or_behind_the_pad_gives_no_row() -> None:
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, :3, 3] = [[40e-3, 0.0, 0.0], [0.0, 0.0, 20e-3], [0.0, 0.0, -30e-3], [18e-3, 0.0, 1e-3]]

@@ -83,7 +83,7 @@ def test_cells_are_those_under_the_patch() -> None:
 def test_the_warning_names_level_width_rule_and_the_next_level() -> None:
     assert tuple(PAD_LEVELS) == PADS
     for level, way in (
-        ("coarse", "level='fine'"),
+        ("coarse", "level='medium'"),
         ("medium", "level='fine'"),
         ("fine", "mesh of your own"),
         ("own", "mesh of your own"),

@@ -94,7 +94,7 @@ def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: in
     settings = BakeSettings() if settings is None else settings
     sensor, grid, camera = at.sensor, at.grid, at.tracer.camera
     pins = settings.pins if sensor.optics.shadows else 0
-    images = settings.images + 6 * pins
+    images = settings.renders(sensor.optics.shadows)
     with Progress(total=images, desc=f"bake {sensor.name}", unit="image", show=progress) as bar:
         touched, around = (BinSums(settings.n_bins, camera.resolution) for _ in range(2))
         for views in at.views(ball_presses(sensor.gelpad, grid, camera, settings, seed)):

@@ -54,6 +54,10 @@ class BakeSettings:
         """Coarse and in seconds, to see that all works."""
         return cls(images=40, n_bins=45, pins=12)
 
+    def renders(self, shadows: bool) -> int:
+        """Images that a bake renders: balls, and with ``shadows`` pins and balls for these."""
+        return self.images + 6 * self.pins * shadows
+
     def depth_range(self, thickness: float) -> tuple[float, float]:
         """Shallowest and deepest press [m] on a pad of this ``thickness`` [m]."""
         deepest = min(self.depth[1], self.deepest_share * thickness)

@@ -1,0 +1,244 @@
+"""The same presses on the rigid pad and on levels of the soft one: one report."""
+
+from __future__ import annotations
+
+import base64
+import html
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from raytac.errors import InputError
+from raytac.frame import TactileFrame
+from raytac.gel.surface import GelSurface
+from raytac.io.folder import result_folder
+from raytac.io.metrics import Metric, versions, write_metrics
+from raytac.physics import Ipc, PhysicsConfig, Rigid
+from raytac.report.measure import machine
+from raytac.report.preview import camera_extent_mm
+from raytac.report.style import STYLE
+from raytac.sensor import TactileSensor
+from raytac.specs import PADS, load_press
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RIGID = "rigid"
+NEAR, RING = 1e-3, 2e-3
+"""Distances from the contact [m] at which the zones of a height difference end."""
+STEP_MM = 0.05
+"""A scale of height differences ends at a multiple of this."""
+FILES = ("report.html", "sheet.png", "metrics.json")
+
+
+@dataclass(frozen=True)
+class PadPress:
+    """One press on one pad at its peak stage."""
+
+    scene: str
+    pad: str
+    """``rigid``, or the level of the soft pad."""
+    frame: TactileFrame
+    seconds: float
+    """Time of the whole press with its image [s]."""
+
+
+def press_pads(
+    scenes: Sequence[str | Path],
+    levels: Sequence[str],
+    *,
+    sensor: str = "gelsight_mini",
+    resolution: tuple[int, int] | None = None,
+    device: str = "auto",
+    seed: int = 0,
+) -> tuple[list[PadPress], TactileSensor]:
+    """Press every scene on the rigid pad and on the soft pad of every level, coarsest first.
+
+    Returns:
+        The presses, pads of a scene side by side, and the sensor of the finest level.
+
+    Raises:
+        InputError: no scene, or an unknown level.
+        BackendError: the soft pad's solver cannot run here.
+    """
+    for level in levels:
+        if level not in PADS:
+            raise InputError("levels", value=level, rule="must be known levels", choices=PADS)
+    if not scenes or not levels:
+        name = "levels" if scenes else "scenes"
+        raise InputError(name, value=(), rule="must name at least one")
+    pads: dict[str, PhysicsConfig] = {RIGID: Rigid(), **{level: Ipc(level=level) for level in PADS if level in levels}}
+    presses = [load_press(scene) for scene in scenes]
+    given = {"outputs": ("rgb", "wrench"), "resolution": resolution, "device": device, "seed": seed}
+    sensors = {pad: TactileSensor(sensor, physics=physics, **given) for pad, physics in pads.items()}
+    made = []
+    for scene in presses:
+        for pad, one in sensors.items():
+            start = time.perf_counter()
+            frame = one.press(scene, progress=True)
+            made.append(PadPress(scene.name, pad, frame, time.perf_counter() - start))
+            logging.getLogger("raytac").info("%s, %s: pressed in %.1f s", scene.name, pad, made[-1].seconds)
+    return made, sensors[list(pads)[-1]]
+
+
+def pad_metrics(presses: Sequence[PadPress]) -> dict[str, Metric]:
+    """``SCENE.PAD.*`` of every press, and its differences to the finest pad's.
+
+    ``press_s``; ``imprint_mm`` (deepest), ``bulge_mm`` (highest above rest), ``contact_mm2``, ``force_n``; and but for the finest pad
+    ``contact_um`` (where both touch: small between soft pads, which are all laid on the object there), ``near_um`` (within 1 mm of the
+    contact of either) and ``ring_um`` (1 to 2 mm from it): root mean square differences of height; ``image``: mean absolute difference
+    of the images [levels of 255].
+    """
+    finest = {press.scene: press for press in presses}
+    metrics: dict[str, Metric] = {}
+    for press in presses:
+        values = {"press_s": press.seconds, **_measured(press.frame)}
+        if press is not finest[press.scene]:
+            values |= differences(press.frame, finest[press.scene].frame)
+        metrics |= {f"{press.scene}.{press.pad}.{key}": value for key, value in values.items() if np.isfinite(value)}
+    return metrics
+
+
+def _measured(frame: TactileFrame) -> dict[str, float]:
+    surface = frame.surface
+    return {
+        "imprint_mm": 1e3 * float(surface.indentation.max()),
+        "bulge_mm": -1e3 * float(surface.indentation.min()),
+        "contact_mm2": 1e6 * float(surface.contact[0].sum()) * surface.grid.pitch[0] * surface.grid.pitch[1],
+        "force_n": -float(frame.force[0, 2]),
+    }
+
+
+def differences(one: TactileFrame, other: TactileFrame) -> dict[str, float]:
+    """Differences of two frames of one press, as of ``pad_metrics``; NaN where there is no node."""
+    assert one.rgb is not None and other.rgb is not None
+    heights = height_differences(one.surface, other.surface)
+    return heights | {"image": float(np.abs(one.rgb[0].astype(float) - other.rgb[0]).mean())}
+
+
+def height_differences(one: GelSurface, other: GelSurface) -> dict[str, float]:
+    """Root mean square difference of height [µm] by zone, as of ``pad_metrics``."""
+    off = 1e6 * (one.height[0].astype(float) - other.height[0])
+    either = one.contact[0] | other.contact[0]
+    near, ring = (widened(either, reach, one.grid.pitch) for reach in (NEAR, RING))
+    where = {"contact_um": one.contact[0] & other.contact[0], "near_um": near & ~either, "ring_um": ring & ~near}
+    return {key: float(np.sqrt((off[mask] ** 2).mean())) if mask.any() else float("nan") for key, mask in where.items()}
+
+
+def widened(mask: np.ndarray, by: float, pitch: tuple[float, float]) -> np.ndarray:
+    """Nodes within ``by`` [m] of the mask along x and y, (Ny, Nx)."""
+    out = mask.copy()
+    for axis, step in ((1, pitch[0]), (0, pitch[1])):
+        grown = out.copy()
+        for k in range(1, round(by / step) + 1):
+            ahead, back = [slice(None)] * 2, [slice(None)] * 2
+            ahead[axis], back[axis] = slice(k, None), slice(None, -k)
+            grown[tuple(ahead)] |= out[tuple(back)]
+            grown[tuple(back)] |= out[tuple(ahead)]
+        out = grown
+    return out
+
+
+def write_pads(presses: Sequence[PadPress], sensor: TactileSensor, out: Path, wall_s: float) -> list[Path]:
+    """Write ``report.html`` (one file), ``sheet.png`` and ``metrics.json``; returns their paths."""
+    metrics = pad_metrics(presses)
+    facts: dict[str, Metric] = {
+        "command": "compare-physics",
+        "sensor": sensor.spec.name,
+        "device": sensor.device_used,
+        **machine(),
+    }
+    with result_folder(out, FILES) as folder:
+        sheet_figure(presses, sensor).savefig(folder / "sheet.png", pil_kwargs={"optimize": True})
+        page = _page(presses, metrics, facts, (folder / "sheet.png").read_bytes())
+        (folder / "report.html").write_text(page, encoding="utf-8")
+        write_metrics(folder / "metrics.json", facts | metrics | versions() | versions(["warp-lang"]) | {"wall_s": wall_s})
+    return [out / name for name in FILES]
+
+
+def sheet_figure(presses: Sequence[PadPress], sensor: TactileSensor) -> Figure:
+    """One row a scene: images, indentations, and each height less that of the finest pad.
+
+    No scale cuts anything off.
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    view = camera_extent_mm(sensor.spec.camera)
+    rows = {scene: [press for press in presses if press.scene == scene] for scene in dict.fromkeys(p.scene for p in presses)}
+    pads = [press.pad for press in next(iter(rows.values()))]
+    count, finest = len(pads), pads[-1]
+    titles = [f"image, {pad}" for pad in pads] + [f"indentation, {pad}" for pad in pads]
+    titles += [f"height, {pad} − {finest}" for pad in pads[:-1]]
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(2.05 * len(titles), 1.24 * len(rows) + 0.45), layout="constrained", dpi=100)
+        figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, hspace=0.0, wspace=0.0)  # type: ignore[union-attr, call-arg]
+        axes = np.atleast_2d(figure.subplots(len(rows), len(titles), squeeze=False))
+        for row, (line, (name, pressed)) in enumerate(zip(axes, rows.items(), strict=True)):
+            grid = pressed[0].frame.surface.grid
+            extent = [1e3 * v for v in (grid.x[0], grid.x[-1], grid.y[-1], grid.y[0])]
+            dents = [1e3 * press.frame.surface.indentation[0] for press in pressed]
+            deepest, highest = max(float(d.max()) for d in dents), min(float(d.min()) for d in dents)
+            for axis, press in zip(line[:count], pressed, strict=True):
+                assert press.frame.rgb is not None
+                axis.imshow(press.frame.rgb[0], extent=view)
+            for axis, dent in zip(line[count : 2 * count], dents, strict=True):
+                shown = axis.imshow(dent, extent=extent, cmap="cividis", vmin=highest, vmax=deepest)
+            bars = [figure.colorbar(shown, ax=list(line[count : 2 * count]), shrink=0.9, pad=0.01)]
+            offs = [dents[-1] - dent for dent in dents[:-1]]
+            end = max(float(np.ceil(max(np.abs(off).max() for off in offs) / STEP_MM - 1e-9)), 1.0) * STEP_MM
+            for axis, off in zip(line[2 * count :], offs, strict=True):
+                shown = axis.imshow(off, extent=extent, cmap="PuOr", vmin=-end, vmax=end)
+            bars.append(figure.colorbar(shown, ax=list(line[2 * count :]), shrink=0.9, pad=0.02, ticks=(-end, 0.0, end)))
+            for bar in bars:
+                bar.set_label("mm", labelpad=1)
+                bar.ax.tick_params(labelsize=7.5, length=2)
+            for axis, title in zip(line, titles, strict=True):
+                axis.set(xticks=[], yticks=[])
+                if row == 0:
+                    axis.set_title(title)
+            line[0].set_ylabel(name)
+    return figure
+
+
+_COLUMNS: Mapping[str, tuple[str, str]] = {
+    "press_s": ("press [s]", ".1f"),
+    "force_n": ("normal force [N]", ".2f"),
+    "imprint_mm": ("imprint [mm]", ".3f"),
+    "bulge_mm": ("bulge [mm]", ".3f"),
+    "contact_mm2": ("contact [mm²]", ".1f"),
+    "contact_um": ("height, contact [µm]", ".1f"),
+    "near_um": ("height, to 1 mm [µm]", ".1f"),
+    "ring_um": ("height, 1 to 2 mm [µm]", ".1f"),
+    "image": ("image [of 255]", ".2f"),
+}
+"""Heading and number format of each figure of the report."""
+
+
+def _page(presses: Sequence[PadPress], metrics: Mapping[str, Metric], facts: Mapping[str, Metric], sheet: bytes) -> str:
+    head = "".join(f"<th>{html.escape(text)}</th>" for text, _ in _COLUMNS.values())
+    lines = []
+    for press in presses:
+        values = [(metrics.get(f"{press.scene}.{press.pad}.{key}"), form) for key, (_, form) in _COLUMNS.items()]
+        cells = "".join(f"<td>{'–' if value is None else format(value, form)}</td>" for value, form in values)
+        lines.append(f"<tr><td>{html.escape(press.scene)}</td><td>{press.pad}</td>{cells}</tr>")
+    said = "".join(f"<tr><td>{html.escape(name)}</td><td>{html.escape(str(value))}</td></tr>" for name, value in facts.items())
+    finest = presses[-1].pad
+    return f"""<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><title>The same presses on rigid and soft pads</title>
+<style>body{{font:15px/1.5 system-ui,sans-serif;max-width:1180px;margin:2rem auto;padding:0 1.2rem}}
+table{{border-collapse:collapse;font-size:13px}}th,td{{padding:.2rem .55rem;text-align:right;border-bottom:1px solid #e4e4e4}}
+td:first-child,td:nth-child(2){{text-align:left}}th{{background:#f5f5f5}}img{{max-width:100%}}</style></head><body>
+<h1>The same presses on rigid and soft pads</h1>
+<p>Each scene at its peak stage. Differences are to the {finest} soft pad: of height, root mean square, where both pads touch,
+within 1 mm of the contact of either, and 1 to 2 mm from it; of the image, mean absolute. The time of a press has its image in it,
+and that of a pad's first press what is made once.</p>
+<table><tr><th>scene</th><th>pad</th>{head}</tr>{"".join(lines)}</table>
+<p><img alt="Images, indentations and height differences" src="data:image/png;base64,{base64.b64encode(sheet).decode("ascii")}"></p>
+<table>{said}</table></body></html>
+"""
