@@ -24,7 +24,7 @@ class Settings:
         gravity: acceleration [m/s²], world frame.
         velocity_tolerance: Newton stops once no unknown would move faster than this [m/s]: ‖p‖_∞ ≤ velocity_tolerance · h.
         max_newton: Newton iterations a step; reaching it is reported.
-        halvings: how often a step that has not converged is taken back and made anew in two halves; each half in turn. The report says so,
+        halvings: how often a step that has not converged is taken back and repeated in two halves; each half in turn. The report says so,
             and its iterations count. 0: the state so far is kept.
         d_hat: distance below which surfaces repel [m]; None: 0.1 of the shortest edge on the deformable surfaces.
         kappa: barrier stiffness κ [Pa]; None: :func:`barrier_stiffness` of the bodies.
