@@ -24,7 +24,7 @@ class Settings:
         gravity: acceleration [m/s²], world frame.
         velocity_tolerance: Newton stops once no unknown would move faster than this [m/s]: ‖p‖_∞ ≤ velocity_tolerance · h.
         max_newton: Newton iterations a step; reaching it is reported.
-        halvings: how often a step that has not converged is taken back and made anew in two halves; each half in turn. The report says so,
+        halvings: how often a step that has not converged is taken back and repeated in two halves; each half in turn. The report says so,
             and its iterations count. 0: the state so far is kept.
         d_hat: distance below which surfaces repel [m]; None: 0.1 of the shortest edge on the deformable surfaces.
         kappa: barrier stiffness κ [Pa]; None: :func:`barrier_stiffness` of the bodies.
@@ -35,7 +35,7 @@ class Settings:
             a step that still changes them then has not converged. 0: they are those at the start of the step, unchecked.
         friction_tolerance: a step renews them until they change by less than this fraction [-].
         linear_tolerance: relative residual ‖r‖/‖g‖ of the linear solve whose p is within ``velocity_tolerance`` and may be the last [-].
-        forcing: the same of the other linear solves [-]; 0: that of ``linear_tolerance``, which is the least.
+        forcing: the same of the other linear solves with block-Jacobi [-]; 0: that of ``linear_tolerance``, which is the least.
         max_linear: PCG iterations a solve.
         preconditioner: of PCG: ``"block_jacobi"``, ``"rest_inverse"`` (bonded bodies' rest matrix inverted once, contacts as a low-rank
             part; ``docs/concepts/preconditioners.md``), or ``"auto"``, whichever was measured to be faster on the device.

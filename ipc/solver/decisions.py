@@ -373,7 +373,7 @@ def conclude(
 
 @wp.kernel
 def choose_good(d: Decisions, f: Flags):
-    """Returns environments that failed, or are to converge and have not, and their frames, to the start of the step."""
+    """Returns environments that failed, or must converge and did not, to the start of the step."""
     env = wp.tid()
     lost = d.failed[env]
     if d.alive[env] != 0 and d.converged[env] == 0 and d.keep[env] == 0:

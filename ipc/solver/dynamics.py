@@ -168,6 +168,13 @@ def aim_bodies(
 
 
 @wp.kernel
+def clear(active: IntArray, values: FloatArray):
+    env = wp.tid()
+    if active[env] != 0:
+        values[env] = wp.float64(0.0)
+
+
+@wp.kernel
 def lengths(p: VecArray2d, residual: VecArray2d, size: FloatArray2d):
     """‖p‖ node by node [m]; 1e300 where p or the residual is not finite."""
     env, i = wp.tid()

@@ -11,7 +11,7 @@ it may be the last.
 (iv) The step is halved until the energy falls enough and no tetrahedron is inverted.
 
 An environment is done when p is small and its frames have arrived, or are blocked. Its friction is then lagged again, as often as the
-settings say. If it does not get done, it returns to the start of the step, which is made anew in two halves, and these likewise: with
+settings say. If it does not get done, it returns to the start of the step, which is repeated in two halves, and these likewise: with
 Coulomb's friction a step may have no solution near, where a shorter one does. Environments never wait on or change each other's
 arithmetic: every decision is a mask.
 
@@ -36,6 +36,7 @@ from ipc.errors import SolverError
 from ipc.reduce import MIN
 from ipc.settings import Settings
 from ipc.solver import decisions, dynamics, frames
+from ipc.solver.block_jacobi import BlockJacobi
 from ipc.solver.pcg import Pcg
 from ipc.solver.potential import Potential
 from ipc.solver.preconditioners import make_preconditioner
@@ -58,7 +59,8 @@ class Newton:
         self._still = wp.zeros_like(potential.x)
         self._friction = int(potential.collision.friction)
         self._renewals = _RENEWALS if _is_held(layout) else 0
-        self._loose = max(settings.linear_tolerance, settings.forcing)
+        loose = settings.forcing if isinstance(self.preconditioner, BlockJacobi) else 0.0
+        self._loose = max(settings.linear_tolerance, loose)
         self._graphs: dict[str, Any] = {}
         """Recordings by name of what was recorded; None for what ran once as it stands."""
         self.timers: dict[str, float] = {}
@@ -109,7 +111,7 @@ class Newton:
     # --- the step --------------------------------------------------------------------------------------------------------------
 
     def step(self, alive: NDArray[np.bool_]) -> dict[str, NDArray]:
-        """Advance the environments of ``alive`` (B,) by a step; returns decisions (B,) by name, and those ``halved``."""
+        """Advance ``alive`` (B,) by a step; returns decisions by name, and which are ``halved``."""
         most = self.settings.halvings
         total = self._attempt(alive, keep=most == 0)
         lost = _unconverged(total, alive) & (most > 0)
@@ -119,7 +121,7 @@ class Newton:
         return total
 
     def _halve(self, total: dict[str, NDArray], lost: NDArray[np.bool_]) -> None:
-        """Make the step of ``lost`` (B,) anew in halves, and its rest at once after a smallest part that does not converge."""
+        """Repeat a step in halves; after a smallest part that fails, the rest at once."""
         pot, most = self.potential, self.settings.halvings
         start, goal = [wp.clone(a) for a in (pot.frame_q, pot.frame_p)], [wp.clone(a) for a in (pot.goal_q, pot.goal_p)]
         dt, share = pot.dt.numpy().copy(), wp.zeros(self.batch, dtype=wp.float64, device=self.device)
@@ -162,7 +164,7 @@ class Newton:
         pot.dt.assign(dt)
 
     def _attempt(self, alive: NDArray[np.bool_], keep: bool) -> dict[str, NDArray]:
-        """Advance the environments of ``alive`` (B,); unless they ``keep`` it, only by a step that converges."""
+        """Advance ``alive`` (B,); a step is taken back unless it converges or ``keep``."""
         since = time.perf_counter()
         self.state.write_alive(alive, keep)
         self._run(self._whole)

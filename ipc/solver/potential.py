@@ -281,8 +281,11 @@ class Potential:
         self.reduce(self.force_size, active, SUM, noise)
 
     def size_of_step(self, active: wp.array, size: wp.array) -> None:
-        """``size`` (B,) ← largest ‖p‖ of a node [m]; above 1e100 where p is not finite."""
-        size.zero_()
+        """``size`` (B,) of ``active`` ← largest ‖p‖ of a node [m].
+
+        Above 1e100 where p is not finite.
+        """
+        self.launch(dynamics.clear, (self.batch,), [active], [size])
         self.launch(dynamics.lengths, self.p.shape, [self.p, self.residual], [self.node_change])
         self.reduce(self.node_change, active, MAX, size)
 

@@ -132,7 +132,10 @@ class StepState:
         return {name: row.copy() for names, rows in self._arrays for name, row in zip(names, rows.numpy(), strict=True)}
 
     def write_alive(self, alive: NDArray[np.bool_], keep: bool) -> None:
-        """Say which environments (B,) take part in the next step, and whether they ``keep`` its state if it does not converge."""
+        """Say which environments (B,) take part in the next step.
+
+        ``keep``: they keep its state if it does not converge.
+        """
         self.decisions.alive.assign(alive.astype(np.int32))
         if keep != self._keep:
             self._keep = keep

@@ -99,6 +99,7 @@ class SoftScene:
             velocity_tolerance=accuracy.tolerance / dt,
             friction_slip=accuracy.slip,
             linear_tolerance=accuracy.linear_tolerance,
+            forcing=accuracy.forcing,
             halvings=0,  # scenes have substeps of their own
         )
         solids = [self._at_start(body.solid, self._start[1][body.name][0]) for body in bodies]

@@ -120,6 +120,8 @@ class SceneSettings(_Settings):
     """A step is solved when no vertex would move further [m]; small against ``slip``."""
     linear_tolerance: float = 1e-6
     """Relative residual of the linear solve: a grasped body must follow far below ``slip``."""
+    forcing: float = 1e-2
+    """The same of the other linear solves, as long as the step is large (block-Jacobi only)."""
     substeps: SubstepLimits = SubstepLimits()
     """Division of steps near contact."""
 

@@ -194,8 +194,11 @@ def test_loose_solves_change_nothing_but_their_number() -> None:
     assert ends[1][2] < 0.8 * ends[0][2], f"{ends[0][2]} PCG iterations, {ends[1][2]} with loose solves"
 
 
-def test_batch_is_single() -> None:
-    batch, alone = blocks_on_pad((True, False), num_envs=3), blocks_on_pad((True, False))
+@pytest.mark.parametrize("forcing", [0.0, 1e-2])
+def test_batch_is_single(forcing: float) -> None:
+    """With loose solves too, where each environment decides by itself when its step may be the last."""
+    fine: dict = {"forcing": forcing, "linear_tolerance": 1e-6, "velocity_tolerance": 1e-6}
+    batch, alone = blocks_on_pad((True, False), num_envs=3, **fine), blocks_on_pad((True, False), **fine)
     batch.set_velocity("b0", np.array([[0, 0, -0.1], [0.02, 0, 0], [0, 0, 0]]))
     alone.set_velocity("b0", (0.02, 0, 0))
     for _ in range(3):

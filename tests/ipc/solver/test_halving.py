@@ -1,4 +1,4 @@
-"""Steps that do not converge: taken back, and made anew in halves."""
+"""Steps that do not converge: taken back, and repeated in halves."""
 
 from __future__ import annotations
 
