@@ -43,7 +43,7 @@ class TableError(ValueError):
 
 
 def filled(text: str, folder: Path = METRICS) -> str:
-    """The page with all its tables made anew from the files of ``folder``."""
+    """The page with all its tables filled from the files of ``folder``."""
 
     def table(match: re.Match[str]) -> str:
         files = {name: read(folder / f"{name}.json") for name in match[2].split()}
@@ -131,14 +131,10 @@ def main() -> int:
         if args.add:
             print(add(Path(args.add[0]), args.add[1], args.add[2]))
             return 0
-        wrong = []
-        for path in pages():
-            text = path.read_text(encoding="utf-8")
-            new = filled(text)
-            if new != text:
-                wrong.append(path)
-                if not args.check:
-                    path.write_text(new, encoding="utf-8")
+        texts = {path: path.read_text(encoding="utf-8") for path in pages()}
+        wrong = {path: new for path, text in texts.items() if (new := filled(text)) != text}
+        for path, new in wrong.items() if not args.check else ():  # after all tables could be filled
+            path.write_text(new, encoding="utf-8")
     except (TableError, OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
