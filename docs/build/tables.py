@@ -61,10 +61,15 @@ def read(path: Path) -> dict[str, object]:
     if not path.is_file():
         raise TableError(f"{path.name}: there is no such file in {path.parent}")
     values = json.loads(path.read_text(encoding="utf-8"))
+    check(values, path)
+    return values
+
+
+def check(values: Values, path: Path) -> None:
+    """Raise ``TableError`` for metrics that do not say how they were measured."""
     for key in (COMMAND, DATE, "device", "wall_s"):
         if key not in values:
             raise TableError(f"{path.name}: must have the key {key!r}: add it with --add")
-    return values
 
 
 def source(values: Values) -> str:
@@ -115,10 +120,10 @@ def add(metrics: Path, name: str, command: str) -> Path:
     """Keep the metrics of a run for a table, with its command and the date of its file."""
     values = json.loads(metrics.read_text(encoding="utf-8"))
     date = datetime.fromtimestamp(metrics.stat().st_mtime, UTC).date().isoformat()
-    path = METRICS / f"{name}.json"
+    path, values = METRICS / f"{name}.json", {COMMAND: command, DATE: date} | values
+    check(values, metrics)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({COMMAND: command, DATE: date} | values, indent=1) + "\n", encoding="utf-8")
-    read(path)
+    path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
     return path
 
 
