@@ -20,7 +20,8 @@ class StepReport:
         converged: Newton met its tolerance and the driven bodies reached their targets or are blocked.
         failed: a number was not finite; the environment stays where the step, or its last part, began until its state is set again.
         stalled: no step lowered the energy although the tolerance was not met.
-        halved: the step did not converge as a whole, and was made in halves, or quarters, which are told together.
+        halved: the step did not converge as a whole, and was made in halves, or quarters; other fields are of all of them. Contact forces
+            are those of the last part: over the step they do not add up to the change of momentum.
         blocked: share of the commanded motion that could not be made, 0 if all of it was, 1 where the environment failed.
         min_gap: least distance between surfaces over all accepted states [m]; inf if none was below d̂.
         min_det: least det F over all accepted states [-].

@@ -43,7 +43,7 @@ class TableError(ValueError):
 
 
 def filled(text: str, folder: Path = METRICS) -> str:
-    """The page with all its tables made anew from the files of ``folder``."""
+    """The page with all its tables filled from the files of ``folder``."""
 
     def table(match: re.Match[str]) -> str:
         files = {name: read(folder / f"{name}.json") for name in match[2].split()}
@@ -61,10 +61,15 @@ def read(path: Path) -> dict[str, object]:
     if not path.is_file():
         raise TableError(f"{path.name}: there is no such file in {path.parent}")
     values = json.loads(path.read_text(encoding="utf-8"))
+    check(values, path)
+    return values
+
+
+def check(values: Values, path: Path) -> None:
+    """Raise ``TableError`` for metrics that do not say how they were measured."""
     for key in (COMMAND, DATE, "device", "wall_s"):
         if key not in values:
             raise TableError(f"{path.name}: must have the key {key!r}: add it with --add")
-    return values
 
 
 def source(values: Values) -> str:
@@ -115,10 +120,10 @@ def add(metrics: Path, name: str, command: str) -> Path:
     """Keep the metrics of a run for a table, with its command and the date of its file."""
     values = json.loads(metrics.read_text(encoding="utf-8"))
     date = datetime.fromtimestamp(metrics.stat().st_mtime, UTC).date().isoformat()
-    path = METRICS / f"{name}.json"
+    path, values = METRICS / f"{name}.json", {COMMAND: command, DATE: date} | values
+    check(values, metrics)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({COMMAND: command, DATE: date} | values, indent=1) + "\n", encoding="utf-8")
-    read(path)
+    path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
     return path
 
 
@@ -131,14 +136,10 @@ def main() -> int:
         if args.add:
             print(add(Path(args.add[0]), args.add[1], args.add[2]))
             return 0
-        wrong = []
-        for path in pages():
-            text = path.read_text(encoding="utf-8")
-            new = filled(text)
-            if new != text:
-                wrong.append(path)
-                if not args.check:
-                    path.write_text(new, encoding="utf-8")
+        texts = {path: path.read_text(encoding="utf-8") for path in pages()}
+        wrong = {path: new for path, text in texts.items() if (new := filled(text)) != text}
+        for path, new in wrong.items() if not args.check else ():  # after all tables could be filled
+            path.write_text(new, encoding="utf-8")
     except (TableError, OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

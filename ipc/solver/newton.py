@@ -153,15 +153,17 @@ class Newton:
             advance(again, end - 0.5 ** (depth + 1), depth + 1)
             advance(again, end, depth + 1)
 
-        advance(lost, 0.5, 1)
-        advance(lost, 1.0, 1)
-        settled, total["converged"] = total["converged"], np.ones_like(total["converged"])
-        advance(lost, 1.0, most)
+        try:
+            advance(lost, 0.5, 1)
+            advance(lost, 1.0, 1)
+            settled, total["converged"] = total["converged"], np.ones_like(total["converged"])
+            advance(lost, 1.0, most)
+        finally:  # also after an error, the goals and the time step are those of the whole step
+            wp.copy(pot.goal_q, goal[0])
+            wp.copy(pot.goal_p, goal[1])
+            pot.dt.assign(dt)
         total["converged"] = np.minimum(total["converged"], settled)
-        total["progress"][lost] = 1.0 - undone[lost]
-        wp.copy(pot.goal_q, goal[0])
-        wp.copy(pot.goal_p, goal[1])
-        pot.dt.assign(dt)
+        total["progress"][lost] = np.where(total["failed"] == 0, 1.0 - undone, 0.0)[lost]
 
     def _attempt(self, alive: NDArray[np.bool_], keep: bool) -> dict[str, NDArray]:
         """Advance ``alive`` (B,); a step is taken back unless it converges or ``keep``."""

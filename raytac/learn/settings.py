@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from raytac.checks import check_known, check_names, check_number, check_whole
+from raytac.errors import InputError
 from raytac.io.options import parse_names, parse_seeds
 from raytac.observe import MODALITIES
 from raytac.physics.registry import PHYSICS
@@ -19,6 +20,8 @@ STEPS = {
     "OpenDrawer": 20_000_000,
 }  # fmt: skip
 """Environment steps of a training by task; those of the last two are a guess."""
+DEVIATION_MOST = 2.0
+"""Greatest standard deviation of an action: the range of actions itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,11 +52,11 @@ class PpoSettings:
     worlds: str = "mujoco"
     """mujoco: on the CPU. mujoco_warp: all environments on the device, without processes."""
     launches: int | None = None
-    """Steps of MuJoCo Warp in a control step, as many as the scene's if not given.
+    """Steps of mujoco_warp in a control step, as many as the scene's if not given.
 
     Of more, a world divides one where something is fast."""
     processes: int = 0
-    """Processes that the environments are spread over, one core each; 0: this process."""
+    """Processes that the environments of mujoco are spread over, one core each; 0: this process."""
     threads: int = 1
     """Threads of the networks on the CPU."""
     history: int | None = None
@@ -84,7 +87,9 @@ class PpoSettings:
     entropy: float = 0.005
     """Weight of the entropy."""
     deviation: float = 1.0
-    """Initial standard deviation of an action, whose range is −1 to 1."""
+    """Initial standard deviation of an action, whose range is −1 to 1.
+
+    From deviation_floor to 2."""
     deviation_floor: float = 0.2
     """Least standard deviation: exploration does not die before the goal is seen."""
     hidden: int = 128
@@ -97,11 +102,19 @@ class PpoSettings:
         check_whole("processes", self.processes, 0)
         check_known("worlds", self.worlds, WORLDS)
         check_known("physics", self.physics, PHYSICS.names if self.worlds == "mujoco" else ("rigid",))
+        if self.processes and self.worlds != "mujoco":
+            raise InputError(
+                "processes", value=self.processes, rule="must be 0 with worlds 'mujoco_warp', which run on the device"
+            )
+        if self.launches is not None and self.worlds != "mujoco_warp":
+            raise InputError("launches", value=self.launches, rule="is a setting of worlds 'mujoco_warp'")
         parse_seeds(self.seeds)
-        above, unit = dict.fromkeys(("learning_rate", "desired_kl", "clip", "deviation", "deviation_floor"), "(0, inf)"), "[0, 1]"
+        check_number("deviation_floor", self.deviation_floor, f"(0, {DEVIATION_MOST}]")
+        check_number("deviation", self.deviation, f"[{self.deviation_floor}, {DEVIATION_MOST}]")
+        above, unit = dict.fromkeys(("learning_rate", "desired_kl", "clip"), "(0, inf)"), "[0, 1]"
         for name, interval in {**above, "gamma": unit, "gae_lambda": unit, "entropy": "[0, inf)"}.items():
             check_number(name, getattr(self, name), interval)
-        for name in ("history", "steps"):
+        for name in ("history", "steps", "launches"):
             if getattr(self, name) is not None:
                 check_whole(name, getattr(self, name))
         for touch in parse_names(self.touch, "touch"):

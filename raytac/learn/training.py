@@ -31,7 +31,7 @@ from raytac.io.folder import FolderLock
 from raytac.io.metrics import VERSIONED, Metric, read_metrics, versions, write_metrics
 from raytac.io.options import parse_names, parse_seeds
 from raytac.learn.evaluation import HELD_OUT, KINDS, Evaluation, append_row, keep_rows, segment_seed
-from raytac.learn.settings import HISTORY, STEPS, PpoSettings
+from raytac.learn.settings import DEVIATION_MOST, HISTORY, STEPS, PpoSettings
 from raytac.report.measure import machine
 
 _LOG = logging.getLogger("raytac")
@@ -64,7 +64,7 @@ class Training:
         network = {"hidden_dims": [args.hidden, args.hidden], "activation": "elu", "obs_normalization": True}
         gaussian = {
             "class_name": "GaussianDistribution", "init_std": args.deviation, "std_type": "log",
-            "std_range": (args.deviation_floor, 2.0),
+            "std_range": (args.deviation_floor, DEVIATION_MOST),
         }  # fmt: skip
         actor = MLPModel(observation, groups, "actor", self.env.num_actions, distribution_cfg=gaussian, **network)
         critic = MLPModel(observation, groups, "critic", 1, **network)
@@ -223,7 +223,7 @@ def _train(args: PpoSettings, touch: str, seed: int, folder: Path, device: str) 
         _LOG.info("%s %s seed %s: done before, in %s", args.task, touch, seed, folder)
         return
     with FolderLock(folder), contextlib.closing(Training(args, touch, seed, folder, device)) as training:
-        name, reached, speeds = f"{args.task} {touch} seed {seed}", False, []
+        name, reached, best, speeds = f"{args.task} {touch} seed {seed}", False, 0.0, []
         due = training.steps + args.evaluate_every
         while training.steps < total and not reached:
             row = training.iterate()
@@ -239,7 +239,8 @@ def _train(args: PpoSettings, touch: str, seed: int, folder: Path, device: str) 
                 result = training.evaluate(min(args.episodes, args.num_envs))
                 training.save()
                 _LOG.info(f"{name}: {training.steps} steps, held out {result.successes}/{result.episodes}")
-                reached = args.target is not None and result.successes >= args.target * result.episodes
+                best = max(best, result.successes / result.episodes)
+                reached = args.target is not None and best >= args.target
             if args.minutes is not None and time.perf_counter() - start > 60.0 * args.minutes:
                 break
         trained_s = training.wall_s
@@ -247,7 +248,7 @@ def _train(args: PpoSettings, touch: str, seed: int, folder: Path, device: str) 
         training.save()
         low, high = result.interval
         metrics: dict[str, Metric] = {
-            "env_steps": training.steps, "done": int(reached or training.steps >= total), "minutes": trained_s / 60.0,
+            "env_steps": training.steps, "done": int(reached or training.steps >= total), "reached": best, "minutes": trained_s / 60.0,
             "episodes": result.episodes, "failed": result.failures,
             "success": result.successes / result.episodes, "success_low": low, "success_high": high, "return": result.mean_return,
             "length": result.mean_length, "env_steps_per_s": training.steps / trained_s, "processes": args.processes,
@@ -308,7 +309,8 @@ def _is_done(args: PpoSettings, folder: Path, total: int) -> bool:
     """True for a training at its end that was evaluated on as many episodes."""
     path = folder / "metrics.json"
     row = read_metrics(path) if path.exists() else {}
-    reached = args.target is not None and float(row.get("success", 0.0)) >= args.target
+    # The last evaluation has other episodes, in which a training that ended at its target may be below it.
+    reached = args.target is not None and max(float(row.get(name, 0.0)) for name in ("success", "reached")) >= args.target
     return bool(row.get("done")) and int(row["episodes"]) >= args.episodes and (reached or int(row["env_steps"]) >= total)
 
 

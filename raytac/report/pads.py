@@ -89,10 +89,10 @@ def press_pads(
 def pad_metrics(presses: Sequence[PadPress]) -> dict[str, Metric]:
     """``SCENE.PAD.*`` of every press, and its differences to the finest pad's.
 
-    ``press_s``; ``imprint_mm`` (deepest), ``bulge_mm`` (highest above rest), ``contact_mm2``, ``force_n``; and but for the finest pad
-    ``contact_um`` (where both touch: small between soft pads, which are all laid on the object there), ``near_um`` (within 1 mm of the
-    contact of either) and ``ring_um`` (1 to 2 mm from it): root mean square differences of height; ``image``: mean absolute difference
-    of the images [levels of 255].
+    ``press_s``; ``imprint_mm`` (deepest), ``bulge_mm`` (highest above rest), ``contact_mm2``, ``force_n``. But for the finest pad also root
+    mean square differences of height: ``contact_um`` (where both touch: small between soft pads, which are all laid on the object there),
+    ``near_um`` (outside the contact of either, up to 1 mm from it) and ``ring_um`` (1 to 2 mm from it); and ``image``: mean absolute
+    difference of the images [levels of 255].
     """
     finest = {press.scene: press for press in presses}
     metrics: dict[str, Metric] = {}
@@ -236,7 +236,7 @@ table{{border-collapse:collapse;font-size:13px}}th,td{{padding:.2rem .55rem;text
 td:first-child,td:nth-child(2){{text-align:left}}th{{background:#f5f5f5}}img{{max-width:100%}}</style></head><body>
 <h1>The same presses on rigid and soft pads</h1>
 <p>Each scene at its peak stage. Differences are to the {finest} soft pad: of height, root mean square, where both pads touch,
-within 1 mm of the contact of either, and 1 to 2 mm from it; of the image, mean absolute. The time of a press has its image in it,
+around the contact of either up to 1 mm, and 1 to 2 mm from it; of the image, mean absolute. The time of a press has its image in it,
 and that of a pad's first press what is made once.</p>
 <table><tr><th>scene</th><th>pad</th>{head}</tr>{"".join(lines)}</table>
 <p><img alt="Images, indentations and height differences" src="data:image/png;base64,{base64.b64encode(sheet).decode("ascii")}"></p>

@@ -95,3 +95,7 @@ def test_metrics_of_a_run_are_kept_with_command_and_date(tmp_path: Path, monkeyp
     values = tables.read(tables.add(run, "presses", "raytac press ball --device cpu"))
     assert values["measured.command"] == "raytac press ball --device cpu" and values["ball.force"] == 1.26
     assert str(values["measured.date"]).startswith("20")
+    run.write_text("{}", encoding="utf-8")
+    with pytest.raises(tables.TableError, match=r"metrics\.json: must have the key 'device'"):
+        tables.add(run, "other", "raytac press ball")
+    assert [path.name for path in tables.METRICS.iterdir()] == ["presses.json"]

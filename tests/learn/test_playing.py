@@ -15,7 +15,17 @@ from raytac.envs import FlatPolicy
 from raytac.envs.roll_ball import RollBall
 from raytac.errors import InputError
 from raytac.io import read_metrics
-from raytac.learn import Film, PolicyPlayer, ScriptedPlayer, find_player, moments, play_policy, shipped_policies, success_rate
+from raytac.learn import (
+    Film,
+    PolicyPlayer,
+    PpoSettings,
+    ScriptedPlayer,
+    find_player,
+    moments,
+    play_policy,
+    shipped_policies,
+    success_rate,
+)
 
 
 def test_the_command_plays_a_scripted_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -101,6 +111,18 @@ def test_bad_input(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=f"{next(iter(wrong))} = "):
             play_policy(ScriptedPlayer("RollBall"), out, **wrong)  # type: ignore[arg-type]
     assert not out.exists()
+
+
+def test_settings_of_a_training_that_would_have_no_effect_are_refused() -> None:
+    for wrong, text in (
+        ({"processes": 2, "worlds": "mujoco_warp"}, "processes = 2: must be 0"),
+        ({"launches": 4}, "launches = 4: is a setting of worlds 'mujoco_warp'"),
+        ({"deviation": 0.1}, r"deviation = 0.1: must be a number in \[0.2, 2.0\]"),
+        ({"deviation": 2.5}, "deviation = 2.5"),
+        ({"deviation_floor": 3.0}, "deviation_floor = 3.0"),
+    ):
+        with pytest.raises(InputError, match=text):
+            PpoSettings(**wrong)  # type: ignore[arg-type]
 
 
 def test_a_strip_shows_moments_that_differ() -> None:

@@ -464,7 +464,7 @@ def affine_motion(rest: Rest, small: Small, env: wp.int32, a: wp.int32, r: VecAr
     s = rest.surface[rest.affine_node[first]]
     for i in range(a - first, 4):
         f = scaled_force(rest, small, env, first + i, r)
-        if small.touched[env, s] != 0:
+        if small.count[env] > 0 and small.touched[env, s] != 0:  # none are left where W could not be computed
             k = 3 * (small.slot[env, s] + i)
             f -= wp.vec3d(small.force[env, k], small.force[env, k + 1], small.force[env, k + 2])
         x += wp.transpose(small.root[env, first + i, a - first]) * f
