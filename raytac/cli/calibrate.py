@@ -100,6 +100,8 @@ class CalibrateArgs(FitOptions, SolverOptions):
     def _optics(self, start: float) -> int:
         from raytac.report.real_calibration import calibration_table, run_calibrate_optics
 
+        if self.out is not None and self.out.resolve() == Path(self.what).resolve():
+            raise InputError("out", value=self.out, rule="must not be the folder of the photographs: every PNG there is one")
         sensor, presses, shots = self.read(Path(self.what), self.sensor)
         written = run_calibrate_optics(
             sensor,

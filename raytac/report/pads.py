@@ -63,7 +63,7 @@ def press_pads(
         The presses, pads of a scene side by side, and the sensor of the finest level.
 
     Raises:
-        InputError: no scene, or an unknown level.
+        InputError: no scene, two of one name, or an unknown level.
         BackendError: the soft pad's solver cannot run here.
     """
     for level in levels:
@@ -74,6 +74,9 @@ def press_pads(
         raise InputError(name, value=(), rule="must name at least one")
     pads: dict[str, PhysicsConfig] = {RIGID: Rigid(), **{level: Ipc(level=level) for level in PADS if level in levels}}
     presses = [load_press(scene) for scene in scenes]
+    names = [scene.name for scene in presses]
+    if len(set(names)) < len(names):
+        raise InputError("scenes", value=names, rule="must have names that differ: keys of metrics begin with them")
     given = {"outputs": ("rgb", "wrench"), "resolution": resolution, "device": device, "seed": seed}
     sensors = {pad: TactileSensor(sensor, physics=physics, **given) for pad, physics in pads.items()}
     made = []

@@ -61,6 +61,7 @@ def test_bad_input(tmp_path: Path) -> None:
         (("sphere",), ("huge",), "levels = 'huge'.*coarse"),
         ((), ("coarse",), "scenes"),
         (("sphere",), (), "levels"),
+        (("sphere", "sphere"), ("coarse",), "names that differ"),
     ):
         with pytest.raises(InputError, match=text):
             pads.press_pads(scenes, levels)

@@ -198,6 +198,8 @@ def test_photographs_of_ones_own_become_a_sensor(
         shutil.copy(path, photos / path.name.replace("6.310mm_", "photo "))
     asked = ["calibrate", str(photos), *ONE_ROUND, "--holdout", "3", "--out", str(out)]
     assert main(asked) == 2 and "--ball-diameter-mm" in capsys.readouterr().err
+    inside = [*asked[:-1], str(photos), "--ball-diameter-mm", "6"]
+    assert main(inside) == 2 and "must not be the folder of the photographs" in capsys.readouterr().err
     assert main([*asked, "--ball-diameter-mm", "6.31"]) == 0
     said = capsys.readouterr().out
     metrics = json.loads((out / "metrics.json").read_text("utf-8"))
