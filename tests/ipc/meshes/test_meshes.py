@@ -94,7 +94,8 @@ def squeezed(cut: ipc.Cut, poisson: float) -> tuple[np.ndarray, np.ndarray, floa
 def test_mirrored_cells_lock_less_and_a_symmetric_press_stays_symmetric() -> None:
     (rest, moved, force), (_, _, locked) = squeezed("mirrored", 0.48), squeezed("alike", 0.48)
     assert locked > 1.3 * force > 0
-    rounding = 1e-6 * np.abs(moved).max()  # grown over the iterations; a hundred times below the tolerance of the solve, 1e-8 m
+    # Straight above a vertex the symmetric state is a ridge of the energy: what rounding begins grows up to the tolerance of the solve.
+    rounding = 1e-8
     for axis in (0, 1):
         flip = np.where(np.arange(3) == axis, -1.0, 1.0)
         where = np.linalg.norm(rest[:, None] - (rest * flip)[None], axis=-1).argmin(axis=0)
