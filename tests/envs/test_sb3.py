@@ -26,7 +26,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 
 from experiments import train_ppo
 from experiments.imitation import imitate, regress
-from experiments.ppo_learner import SMALLEST_SIDE, Checkpoint, Learner, Recipe, evaluate, tactile_settings
+from experiments.ppo_learner import SMALLEST_SIDE, Checkpoint, Learner, Recipe, evaluate_learner, tactile_settings
 from experiments.ppo_training import Training
 from raytac.envs.roll_ball import RollBall
 from raytac.envs.sb3 import ProcessVecEnv, TactileVecEnv
@@ -187,9 +187,9 @@ def test_a_policy_is_saved_without_code_and_plays_the_same(tmp_path: Path, short
     np.testing.assert_array_equal(other.predict(observation), learner.predict(observation))  # type: ignore[arg-type]
     mine, its = learner.normaliser.obs_rms, other.normaliser.obs_rms
     np.testing.assert_array_equal(mine["goal"].mean, its["goal"].mean)  # type: ignore[index]
-    result = evaluate(other, 3)
+    result = evaluate_learner(other, 3)
     assert result.episodes == 3 and result.mean_length <= short_episodes
-    assert evaluate(other, 1).episodes == 1
+    assert evaluate_learner(other, 1).episodes == 1
     (tmp_path / "wrong.pt").write_text("no checkpoint")
     for name in ("wrong.pt", "missing.pt"):
         with pytest.raises(InputError, match="checkpoint"):
