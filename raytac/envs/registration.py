@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Final, NoReturn
+from collections.abc import Callable
+from typing import Any, Final
 
 from raytac.errors import BackendError
 
@@ -44,9 +45,19 @@ def register_envs() -> None:
             gymnasium.register(_WARP_NAMES[name], vector_entry_point=vector, kwargs={"task": name})
 
 
-def raise_absent(name: str, error: ModuleNotFoundError) -> NoReturn:
-    """Raise ``BackendError`` if ``name`` lacks a learner's library, else ``error``."""
-    package = (error.name or "").partition(".")[0]
-    if package not in LEARNERS:
-        raise error
-    raise BackendError(f"{name} needs {LEARNERS[package]}, which is not installed: pip install 'raytac[rl]'") from error
+def public_names(attribute: Callable[[str], Any]) -> Callable[[str], Any]:
+    """Make a package's ``__getattr__`` from that of its stub.
+
+    It raises ``BackendError`` where a name needs a learner's library that is absent.
+    """
+
+    def get(name: str) -> Any:
+        try:
+            return attribute(name)
+        except ModuleNotFoundError as error:
+            package = (error.name or "").partition(".")[0]
+            if package not in LEARNERS:
+                raise
+            raise BackendError(f"{name} needs {LEARNERS[package]}, which is not installed: pip install 'raytac[rl]'") from error
+
+    return get

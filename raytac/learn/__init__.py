@@ -1,17 +1,8 @@
 """Policies for the tasks of ``raytac.envs``: training by PPO, held-out evaluation, play."""
 
-from typing import Any
-
 import lazy_loader
 
-from raytac.envs.registration import raise_absent
+from raytac.envs.registration import public_names
 
 _attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-
-def __getattr__(name: str) -> Any:
-    """Public name; raises ``BackendError`` where it needs a learner's library that is absent."""
-    try:
-        return _attribute(name)
-    except ModuleNotFoundError as error:
-        raise_absent(name, error)
+__getattr__ = public_names(_attribute)

@@ -458,7 +458,10 @@ def scaled_force(rest: Rest, small: Small, env: wp.int32, a: wp.int32, r: VecArr
 
 @wp.func
 def affine_motion(rest: Rest, small: Small, env: wp.int32, a: wp.int32, r: VecArray2d) -> wp.vec3d:
-    """L⁻ᵀ (L⁻¹ r − W t) at affine node a."""
+    """L⁻ᵀ (L⁻¹ r − W t) at affine node a.
+
+    L⁻¹ r is computed again, since other threads overwrite z, where it stood.
+    """
     x = wp.vec3d()
     first = 4 * (a / 4)
     s = rest.surface[rest.affine_node[first]]
