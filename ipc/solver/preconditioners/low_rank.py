@@ -60,7 +60,9 @@ class Small:
 
     ``touched``, ``slot`` (B, s): mark of a surface node that touches, and its place among the contact nodes.
     ``count`` (B,): contact nodes; more than m do not fit.    ``pads`` (B,): those of pads, the first ones.    ``node`` (B, m).
-    ``a`` (B, m, m): the upper half of S, then (K + S)⁻¹.    ``k`` (B, m, m): K.    ``product`` (B, m, m), ``row``, ``column`` (B, m): work space.
+    ``known`` (B,): pad nodes of which ``k`` is K; −1 after ``node`` has changed.
+    ``a`` (B, m, m): the upper half of S, then (K + S)⁻¹.    ``k`` (B, m, m): K.
+    ``product`` (B, m, m), ``row``, ``column`` (B, m): work space.
     ``w`` (B, 3m, 3m): W [N/m].
     ``t``, ``force`` (B, 3m): J K_0⁻¹ r [m], on affine nodes L⁻¹ r, and W t [N].
     ``root`` (B, A, 4): blocks of an affine node's row of L⁻¹, at the nodes of its body.
@@ -71,6 +73,7 @@ class Small:
     count: IntArray
     pads: IntArray
     node: IntArray2d
+    known: IntArray
     a: wp.array3d(dtype=wp.mat33d)
     k: wp.array3d(dtype=wp.mat33d)
     product: wp.array3d(dtype=wp.mat33d)
@@ -148,6 +151,8 @@ def place_contacts(rest: Rest, active: IntArray, small: Small):
         place += small.touched[env, other]
     small.slot[env, s] = place
     if place < small.node.shape[1]:
+        if small.node[env, place] != rest.surface_node[s]:
+            small.known[env] = -1
         small.node[env, place] = rest.surface_node[s]
 
 
@@ -384,16 +389,23 @@ def factor_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
     if active[env] == 0 or not fits(small, env):
         return
     m, pads = small.count[env], small.pads[env]
+    known = small.known[env] == pads
     for e in range(lane, m * m, lanes):
         i = e / m
         j = e - m * i
         if i < pads and j < pads:
-            small.k[env, i, j] = rest_block(rest, small.node[env, i], small.node[env, j])
+            if not known:
+                small.k[env, i, j] = rest_block(rest, small.node[env, i], small.node[env, j])
         elif i == j:
             small.k[env, i, j] = wp.identity(n=3, dtype=wp.float64)
         else:
             small.k[env, i, j] = wp.mat33d()
-    good = invert_small(small.k, small, env, pads, lane, lanes)
+    good = wp.bool(True)
+    if not known:
+        good = invert_small(small.k, small, env, pads, lane, lanes)
+    wait_for_block()
+    if lane == 0:
+        small.known[env] = pads
     if good:
         for e in range(lane, m * m, lanes):
             i = e / m
@@ -424,15 +436,18 @@ def factor_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
         for e in range(lane, m * m, lanes):
             i = e / m
             j = e - m * i
-            W = small.k[env, i, j]
-            for n in range(m):
-                W -= small.product[env, i, n] * small.k[env, n, j]
-            for p in range(3):
-                for q in range(3):
-                    small.w[env, 3 * i + p, 3 * j + q] = W[p, q]
+            if i <= j:
+                W = small.k[env, i, j]
+                for n in range(m):
+                    W -= small.product[env, i, n] * small.k[env, n, j]
+                for p in range(3):
+                    for q in range(3):
+                        small.w[env, 3 * i + p, 3 * j + q] = W[p, q]
+                        small.w[env, 3 * j + q, 3 * i + p] = W[p, q]
     elif lane == 0:
         # Something is not finite: without contacts it is still a preconditioner.
         small.count[env] = 0
+        small.known[env] = -1
     wait_for_block()
     for e in range(lane, m * m, lanes):
         small.a[env, e / m, e % m] = wp.mat33d()
@@ -529,6 +544,7 @@ class LowRank:
         small.touched, small.slot = zeros(batch, nodes, dtype=wp.int32), zeros(batch, nodes, dtype=wp.int32)
         small.count, small.pads = zeros(batch, dtype=wp.int32), zeros(batch, dtype=wp.int32)
         small.node = zeros(batch, room, dtype=wp.int32)
+        small.known = wp.full(batch, -1, dtype=wp.int32, device=device)
         small.a, small.k, small.product = (zeros(batch, room, room, dtype=wp.mat33d) for _ in range(3))
         small.row, small.column = zeros(batch, room, dtype=wp.mat33d), zeros(batch, room, dtype=wp.mat33d)
         small.w = zeros(batch, 3 * room, 3 * room, dtype=wp.float64)
