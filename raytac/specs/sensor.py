@@ -144,7 +144,7 @@ class GelpadSpec:
     """τ [s] of damping along a contact's normal, E (ε + τ dε/dt); for rigid pads in worlds.
     Kelvin and Voigt's model. Not measured: with 2 ms the loss tangent is 0.13 at 10 Hz."""
     surface: HeightMap | None = None
-    """Outer surface at rest in place of a dome, z = 0 in its middle; ``dome_radius`` is then inf."""
+    """Outer surface at rest in place of a dome, z = 0 in its middle; ``dome_radius`` is inf."""
 
     def __post_init__(self) -> None:
         check_fields(vars(self), SENSOR_SCHEMA["gelpad"], "gelpad")
