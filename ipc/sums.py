@@ -15,6 +15,7 @@ from ipc.arrays import filled
 from ipc.bodies.body import AffineBody, Body, rotation_matrix
 from ipc.bodies.layout import Layout
 from ipc.contact import friction
+from ipc.solver.blocks import THREADS
 from ipc.solver.potential import Potential
 from ipc.sum_kernels import BodySums, PairSums, SumLayout, sum_bodies, sum_pairs
 
@@ -91,13 +92,14 @@ class StepSums:
         """Write ``arrays``, unless they are of the present state."""
         if self._fresh:
             return
-        s, layout = self._potential, self._layout
-        shape = self._bodies.force.shape
-        wp.launch(sum_bodies, dim=shape, inputs=[layout, s.x, s.y, s.v, s.R, s.t, s.vert_gradient, self._bodies], device=s.device)
+        s, layout, threads = self._potential, self._layout, THREADS if self._potential.device.is_cuda else 1
+        dim, inputs = (*self._bodies.force.shape, threads), [layout, s.x, s.y, s.v, s.R, s.t, s.vert_gradient, threads]
+        wp.launch(sum_bodies, dim, inputs, [self._bodies], device=s.device, block_dim=THREADS)
         lagged = s.collision.lagged if s.collision.friction else _no_friction(s)
-        inputs = [layout, s.x, s.x_start, s.collision.contacts, lagged, s.settings.friction_slip, self._pairs]
-        if self._pairs.normal.shape[1]:
-            wp.launch(sum_pairs, dim=self._pairs.normal.shape, inputs=inputs, device=s.device)
+        dim = (*self._pairs.normal.shape, threads)
+        inputs = [layout, s.x, s.x_start, s.collision.contacts, lagged, s.settings.friction_slip, threads]
+        if dim[1]:
+            wp.launch(sum_pairs, dim, inputs, [self._pairs], device=s.device, block_dim=THREADS)
         self._fresh = True
 
     @property

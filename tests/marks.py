@@ -47,6 +47,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "robots/test_picture.py",  # MuJoCo's own pictures
         "specs/test_press_of.py",
         "test_bake_end_to_end.py",
+        "test_pad_surface.py",
         "test_cli.py",
         "test_doctor.py",
         "test_press_end_to_end.py",
@@ -98,6 +99,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "test_arguments.py",
         "test_device.py",
         "test_fuzz_inputs.py",
+        "test_pad_surface.py",
         "test_render.py",
         "test_show.py",
         "test_sensor.py",

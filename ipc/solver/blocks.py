@@ -26,3 +26,9 @@ def wait_for_block():
 def block_sum(value: wp.float64) -> wp.float64:
     """Sum over the threads of the block, in a fixed order; every thread gets it."""
     return wp.tile_extract(wp.tile_sum(wp.tile(value)), 0)
+
+
+@wp.func
+def block_max(value: wp.float64) -> wp.float64:
+    """The largest of the threads' values."""
+    return wp.tile_extract(wp.tile_max(wp.tile(value)), 0)

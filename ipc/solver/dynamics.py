@@ -55,6 +55,21 @@ def inertia_target(
 
 
 @wp.kernel
+def sum_followers(
+    vert_gradient: VecArray2d, verts: VertexMap, nodes: IntArray, active: IntArray, threads: wp.int32, out: FloatArray2d
+):
+    """Contact gradient of nodes that many vertices follow, three numbers each; blocks of threads (B, nodes, ``threads``)."""
+    env, k, lane = wp.tid()
+    g = wp.vec3d()
+    if active[env] != 0:
+        for f in range(verts.follower_start[nodes[k]] + lane, verts.follower_start[nodes[k] + 1], threads):
+            g += verts.follower_weight[f] * vert_gradient[env, verts.follower[f]]
+    wp.tile_store(out[env], wp.tile_sum(wp.tile(g[0])), offset=3 * k)
+    wp.tile_store(out[env], wp.tile_sum(wp.tile(g[1])), offset=3 * k + 1)
+    wp.tile_store(out[env], wp.tile_sum(wp.tile(g[2])), offset=3 * k + 2)
+
+
+@wp.kernel
 def node_gradient(
     y: VecArray2d,
     local_target: VecArray2d,
@@ -62,6 +77,8 @@ def node_gradient(
     masses: Masses,
     dt: FloatArray,
     vert_gradient: VecArray2d,
+    crowded: IntArray,
+    summed: FloatArray2d,
     R: MatArray2d,
     node_body: IntArray,
     node_free: IntArray,
@@ -74,7 +91,8 @@ def node_gradient(
 ):
     """Adds inertia, drag and contact to the elastic gradient.
 
-    The residual is its negative on the unknowns, zero on bonded nodes.
+    The residual is its negative on the unknowns, zero on bonded nodes. ``crowded`` (N,) is a node's place in ``summed``
+    (:func:`sum_followers`), or −1.
     ``force_size`` is the sum of the sizes of elastic and contact force [N], which scales the rounding of energies.
     """
     env, i = wp.tid()
@@ -89,9 +107,12 @@ def node_gradient(
         if masses.inertia[k] != wp.float64(0.0):
             pull = (masses.inertia[k] * inertia_scale) * (y[env, j] - local_target[env, j])
             g += pull + (masses.drag[k] / h) * (y[env, j] - local_start[env, j])
-    contact = wp.vec3d()
-    for k in range(verts.follower_start[i], verts.follower_start[i + 1]):
-        contact += verts.follower_weight[k] * vert_gradient[env, verts.follower[k]]
+    contact, place = wp.vec3d(), 3 * crowded[i]
+    if place >= 0:
+        contact = wp.vec3d(summed[env, place], summed[env, place + 1], summed[env, place + 2])
+    else:
+        for k in range(verts.follower_start[i], verts.follower_start[i + 1]):
+            contact += verts.follower_weight[k] * vert_gradient[env, verts.follower[k]]
     g += wp.transpose(R[env, node_body[i]]) * contact
     force_size[env, i] = elastic + wp.length(contact)
     gradient[env, i] = g

@@ -159,6 +159,14 @@ def spread_row(system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, 
 
 
 @wp.func
+def add_motion(env: wp.int32, first: wp.int32, f: mat34d, out: VecArray2d):
+    """out += f at the four nodes of an affine body whose first node is ``first``; −1 for none."""
+    if first >= 0:
+        for m in range(4):
+            wp.atomic_add(out, env, first + m, row_column(f, m))
+
+
+@wp.func
 def row_weight(system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32) -> wp.float64:
     """1, or of a concave row −1; 0 where the matrix must be definite."""
     if contacts.concave[env, r] != 0:
@@ -242,8 +250,29 @@ def multiply_rows(
     total = wp.float64(0.0)
     first = c * threads + lane
     if active[env] != 0 and first < lanes:
+        body, affine = wp.int32(-1), mat34d()
         for r in range(first, rows_of(contacts, env), lanes):
-            total += add_row(system, contacts, env, r, p, out)
+            verts, row = contacts.row_verts[env, r], contacts.row[env, r]
+            weight = row_weight(system, contacts, env, r)
+            s = row_motion(system, verts, row, env, p)
+            total += weight * s * s
+            for k in range(4):
+                v = verts[k]
+                if v >= 0:
+                    if system.verts.count[v] > 0:
+                        q = (weight * s) * (wp.transpose(system.R[env, system.verts.body[v]]) * row_column(row, k))
+                        node = system.verts.nodes[v, 0]
+                        if system.verts.count[v] == 1:
+                            if system.free[node] != 0:
+                                wp.atomic_add(out, env, node, system.verts.weight[v, 0] * q)
+                        else:
+                            if node != body:
+                                add_motion(env, body, affine, out)
+                                body, affine = node, mat34d()
+                            for m in range(4):
+                                for i in range(3):
+                                    affine[i, m] = affine[i, m] + system.verts.weight[v, m] * q[i]
+        add_motion(env, body, affine, out)
     wp.tile_store(partial[env], wp.tile_sum(wp.tile(total)), offset=c)
 
 

@@ -36,7 +36,6 @@ from ipc.errors import SolverError
 from ipc.reduce import MIN
 from ipc.settings import Settings
 from ipc.solver import decisions, dynamics, frames
-from ipc.solver.block_jacobi import BlockJacobi
 from ipc.solver.pcg import Pcg
 from ipc.solver.potential import Potential
 from ipc.solver.preconditioners import make_preconditioner
@@ -59,8 +58,7 @@ class Newton:
         self._still = wp.zeros_like(potential.x)
         self._friction = int(potential.collision.friction)
         self._renewals = _RENEWALS if _is_held(layout) else 0
-        loose = settings.forcing if isinstance(self.preconditioner, BlockJacobi) else 0.0
-        self._loose = max(settings.linear_tolerance, loose)
+        self._loose = max(settings.linear_tolerance, settings.forcing)
         self._graphs: dict[str, Any] = {}
         """Recordings by name of what was recorded; None for what ran once as it stands."""
         self.timers: dict[str, float] = {}

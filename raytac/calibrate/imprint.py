@@ -96,7 +96,7 @@ def pixel_geometry(
     ``KNOTS``. Where ``press`` is −1 the pad is at rest. The ray is met by iterating its height; slopes of the view are below 0.4, so
     that six steps leave less than a micrometre.
     """
-    camera, (rx, ry) = sensor.camera, sensor.gelpad.dome_radius
+    camera = sensor.camera
     (cx, cy), (px, py), distance = camera.principal_point, camera.pixel_pitch, -camera.position[2]
     flat_x, flat_y = (u - cx) * px, (v - cy) * py
     pressed = press >= 0
@@ -117,8 +117,7 @@ def pixel_geometry(
         z = -sensor.gelpad.sag(x, y) - a * height
     tan = np.where(pressed, _slope(slopes, t, a_share), 0)
     rho = np.maximum(np.hypot(dx, dy), 1e-9)
-    zx = -x / np.sqrt(rx * rx - x * x) if np.isfinite(rx) else 0 * x
-    zy = -y / np.sqrt(ry * ry - y * y) if np.isfinite(ry) else 0 * y
+    zx, zy = sensor.gelpad.slope(x, y)
     n = np.stack([zx + tan * dx / rho, zy + tan * dy / rho, -np.ones_like(x)])
     return PixelGeometry(np.stack([x, y, z]), n / np.linalg.norm(n, axis=0))
 

@@ -242,7 +242,7 @@ def leds_inside(sensor: SensorSpec, p: LightParameters, *, lengths: np.ndarray, 
     pad, ceiling = sensor.gelpad, np.full(len(leds), CEILING)
     for k in np.flatnonzero(p.virtual):
         corner = np.minimum(1e-3 * (np.abs(leds[k, :2]) + reach[k, :2]), 0.5 * np.array(pad.size))
-        ceiling[k] = VIRTUAL_CEILING - 1e3 * pad.sag(*corner)
+        ceiling[k] = VIRTUAL_CEILING - 1e3 * max(float(pad.sag(a * corner[0], b * corner[1])) for a in (-1, 1) for b in (-1, 1))
     floor = 1e3 * sensor.case.floor_z + reach[:, 2]
     leds[:, 2] = np.clip(leds[:, 2], floor, np.maximum(ceiling - reach[:, 2], floor))
     return leds

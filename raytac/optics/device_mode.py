@@ -19,7 +19,7 @@ from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid, rounded_envs
 from raytac.optics.base import OpticalMode, OpticsConfig, OpticsImages
 from raytac.optics.camera import Pinhole
-from raytac.optics.geometry import CoatField, CoatLayout, check_view, see, seen_images
+from raytac.optics.geometry import CoatField, CoatLayout, check_view, concave_cover, see, seen_images
 from raytac.optics.ink import checked_ink
 from raytac.optics.refraction import Slab
 from raytac.optics.runtime import RENDERER, load_mitsuba, no_collection
@@ -39,7 +39,7 @@ class FrameInputs:
     """Device arrays besides the surface that a recorded frame reads; Dr.Jit wants them named."""
 
     rest: Float
-    """Heights at rest [m], Ny·Nx."""
+    """Heights at rest [m], Ny·Nx, as ``concave_cover`` gives them."""
     own: Any
     """Further arrays of the mode."""
     ink: Float | None = None
@@ -155,7 +155,7 @@ class DeviceMode(ABC):
         check_view(self.camera, grid)
         self.layout = CoatLayout.from_grid(grid)
         # A copy: an array on NumPy memory that a surface shares would be one input twice for a recording.
-        self._rest = self.mi.Float(grid.rest.astype(np.float32).ravel())
+        self._rest = self.mi.Float(concave_cover(grid).astype(np.float32).ravel())
         self._inputs = FrameInputs(self._rest, self._build(grid))
         self._grid = grid
 

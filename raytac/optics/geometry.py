@@ -23,6 +23,8 @@ TILE = 0.5e-3
 Bounds on z hold two: a camera ray of slope t may be that over t off its tile's height, 2.8 mm for the Mini's steepest ray."""
 LOOK_UP_Z = -1.0e-3
 """Height at which a camera ray looks up its tile [m]: between rest and a deep press."""
+_TALL = 2.5e-3
+"""Depth of a gel at rest beyond which bounds of tiles are not relied upon [m]."""
 _BULGE = 0.2
 """Height of a bulge over the gel's thickness up to which what is in view is known."""
 _RAYS = 33
@@ -82,6 +84,30 @@ def nodes_in_view(g: NodeGrid, camera: Pinhole, thickness: float) -> tuple[int, 
     return spans[0][0], spans[1][0], spans[0][1], spans[1][1]
 
 
+def concave_cover(grid: PadGrid) -> np.ndarray:
+    """A concave surface on or above the resting gel [m], (Ny, Nx), for ``CoatField``.
+
+    A function of x plus one of y, the upper hulls of what the gel has at most along each: a dome, and any other such sum that is concave,
+    is its own.
+    """
+    over_x = _upper_hull(grid.x, grid.rest.max(axis=0))
+    over_y = _upper_hull(grid.y, (grid.rest - over_x).max(axis=1))
+    cover = over_x[None, :] + over_y[:, None]
+    return grid.rest if np.abs(cover - grid.rest).max() < 1e-9 else cover
+
+
+def _upper_hull(at: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Least concave function over ``values`` at rising places, (N,) (A. M. Andrew, 1979)."""
+    hull: list[int] = []
+    for k in range(len(at)):
+        while len(hull) > 1 and (values[hull[-1]] - values[hull[-2]]) * (at[k] - at[hull[-1]]) <= (
+            values[k] - values[hull[-1]]
+        ) * (at[hull[-1]] - at[hull[-2]]):
+            hull.pop()
+        hull.append(k)
+    return np.interp(at, at[hull], values[hull])
+
+
 @dataclass(frozen=True)
 class CoatLayout(NodeGrid):
     """Constants of all frames: the pad's grid and its tiling."""
@@ -90,13 +116,16 @@ class CoatLayout(NodeGrid):
     tile_y: int
     tiles_x: int
     tiles_y: int
+    tall: bool = False
+    """True where the gel at rest is so deep that a ray may miss its tile's bounds."""
 
     @classmethod
     def from_grid(cls, grid: PadGrid) -> CoatLayout:
         (ny, nx), (dx, dy) = grid.shape, grid.pitch
         tile_x, tile_y = max(1, round(TILE / dx)), max(1, round(TILE / dy))
         tiles = -(-nx // tile_x), -(-ny // tile_y)
-        return cls(nx, ny, float(grid.x[0]), float(grid.y[0]), dx, dy, tile_x, tile_y, *tiles)
+        tall = bool(grid.rest.min() < -_TALL)
+        return cls(nx, ny, float(grid.x[0]), float(grid.y[0]), dx, dy, tile_x, tile_y, *tiles, tall)
 
 
 class CoatField:
@@ -107,7 +136,10 @@ class CoatField:
     """
 
     def __init__(self, mi: Any, layout: CoatLayout, rest: Any, height: Any) -> None:
-        """``rest`` (Ny·Nx) and ``height`` (B·Ny·Nx): device Floats [m]."""
+        """``rest`` (Ny·Nx) and ``height`` (B·Ny·Nx): device Floats [m].
+
+        ``rest``: the gel at rest, or a concave surface above it, as of ``concave_cover``.
+        """
         self.mi, self.layout, self.rest, self.height = mi, layout, rest, height
         self.nodes, self.cells = dr.ravel(pack_nodes(mi, layout, height)), dr.ravel(pack_cells(mi, layout, height))
         dr.eval(self.nodes, self.cells)
@@ -192,7 +224,7 @@ class CoatField:
 
         Walks the shadow ray cell by cell and keeps the smallest clearance angle. ``tan_half`` is half the emitter's extent seen
         from ``p`` across the ray in the vertical plane: between −tan_half and +tan_half the share grows linearly, which is exact for
-        a rectangle cut by a straight horizon. The walk ends where no surface can reach the ray: the rest surface of a pad is convex
+        a rectangle cut by a straight horizon. The walk ends where no surface can reach the ray: ``rest`` is convex
         towards the object (region of the camera side convex), so the clearance above it grows at least linearly from p to the
         light, and only indentation deeper than that can block it. Where the bounds of the tile under the ray (its 3 × 3 neighbourhood)
         rule that out, the walk skips a whole tile; where the deepest point of the pad does, it ends.
@@ -301,7 +333,7 @@ def see(mi: Any, field: CoatField, camera: Pinhole, envs: int, jitter: tuple[flo
     column, row = camera.pixel(i - env * (width * height))
     u, v = mi.Float(column) + jitter[0], mi.Float(row) + jitter[1]
     origin, (tx, ty) = camera.ray(u, v)
-    p = field.camera_hit(env, origin, tx, ty, oblique=camera.lens.tilts)
+    p = field.camera_hit(env, origin, tx, ty, oblique=camera.lens.tilts or field.layout.tall)
     n = field.normal(env, p.x, p.y)
     exit = None
     if camera.slab is not None:

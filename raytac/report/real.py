@@ -75,7 +75,7 @@ ABLATIONS: dict[str, Ablation] = {
     "point_leds": Ablation(sensor=lambda s: _leds(s, size=(1e-4, 1e-4)), fixed=("height",)),
     "no_lobe": Ablation(sensor=lambda s: _leds(s, lobe=1.0), fixed=("lobe",)),
     "no_glow": Ablation(sensor=lambda s: _leds(s, glow=0.0), fixed=("glow",)),
-    "flat_pad": Ablation(sensor=lambda s: replace(s, gelpad=replace(s.gelpad, dome_radius=(np.inf, np.inf)))),
+    "flat_pad": Ablation(sensor=lambda s: replace(s, gelpad=replace(s.gelpad, dome_radius=(np.inf, np.inf), surface=None))),
     "no_response_curve": Ablation(
         sensor=lambda s: replace(s, response=replace(s.response, gamma=1.0, black_level=(0.0, 0.0, 0.0))), fixed=("stray",)
     ),

@@ -1,4 +1,5 @@
 from .files import available as available
+from .height_map import HeightMap as HeightMap
 from .marker_motion import MarkerMotionSpec as MarkerMotionSpec
 from .marker_motion import PunchSpec as PunchSpec
 from .marker_motion import load_marker_motion as load_marker_motion

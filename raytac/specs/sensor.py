@@ -14,6 +14,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from raytac.errors import SpecError
+from raytac.specs.height_map import HeightMap
 from raytac.specs.lens import Lens
 from raytac.specs.marker_motion import MarkerMotionSpec
 from raytac.specs.toml import ANY, Flag, Integer, Number, Schema, Text, check_fields
@@ -95,6 +96,13 @@ SENSOR_SCHEMA: Final[dict[str, Schema]] = {
 }
 """Table (``""``: the top of the file) to its keys."""
 
+SURFACE_SCHEMA: Final[Schema] = {
+    "surface": Text(),
+    "surface_unit_mm": Number("(0, 1000]", default=1e-3),
+    "surface_pitch_mm": Number("(0, 5]", length=2, default=()),
+}
+"""Further keys of ``[gelpad]``: a file of the surface, in place of a dome."""
+
 LED_SCHEMA: Final[Schema] = {
     "name": _NAME,
     "layer": _NAME,
@@ -135,18 +143,33 @@ class GelpadSpec:
     relaxation_time: float = 0.002
     """τ [s] of damping along a contact's normal, E (ε + τ dε/dt); for rigid pads in worlds.
     Kelvin and Voigt's model. Not measured: with 2 ms the loss tangent is 0.13 at 10 Hz."""
+    surface: HeightMap | None = None
+    """Outer surface at rest in place of a dome, z = 0 in its middle; ``dome_radius`` is inf."""
 
     def __post_init__(self) -> None:
         check_fields(vars(self), SENSOR_SCHEMA["gelpad"], "gelpad")
+        if not isinstance(self.surface, (HeightMap, type(None))):
+            raise SpecError("must be a HeightMap or None", key="gelpad.surface", value=self.surface)
 
     def sag(self, x: Any, y: Any) -> Any:
-        """Depth [m] of the surface at rest below the pad centre at ``x``, ``y`` [m] in the radii.
+        """Depth [m] of the surface at rest below the pad centre at ``x``, ``y`` [m] on the pad.
 
-        s(x; Rx) + s(y; Ry) with the sagitta s(u; R) = R − √(R² − u²) = u² / (R + √(R² − u²)): a circular arc of radius Rx
-        carried along one of radius Ry.
+        That of ``surface``, or s(x; Rx) + s(y; Ry) with the sagitta s(u; R) = R − √(R² − u²) = u² / (R + √(R² − u²)): a circular arc
+        of radius Rx carried along one of radius Ry.
         """
+        if self.surface is not None:
+            return -self.surface.height(x, y)
         return sum(
             u * u / (radius + (radius * radius - u * u) ** 0.5) for u, radius in zip((x, y), self.dome_radius, strict=True)
+        )
+
+    def slope(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """∂z/∂x and ∂z/∂y of the surface at rest at ``x``, ``y`` [m] on the pad."""
+        if self.surface is not None:
+            return self.surface.slope(x, y)
+        rx, ry = self.dome_radius
+        return tuple(  # type: ignore[return-value]
+            -u / (radius * radius - u * u) ** 0.5 if math.isfinite(radius) else 0.0 * u for u, radius in ((x, rx), (y, ry))
         )
 
 

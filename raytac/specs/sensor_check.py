@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from raytac.errors import SpecError
+from raytac.specs.height_map import HeightMap
 from raytac.specs.lens import Lens
 from raytac.specs.sensor import LedSpec, SensorSpec, Vec3, shading_degree
 from raytac.specs.toml import in_mm
@@ -19,6 +20,8 @@ _STEEPEST = 1.2
 """Largest slope to the pad's z of a ray in the view of a tilted camera: 50 degrees."""
 _LENS_ERROR = 1e-3
 """Most [px] that a pixel may be off after its distortion is taken off and put on again."""
+_HIGHEST = 0.1
+"""Most that a pad's surface may rise above its middle, in the thickness of the pad."""
 _SLACK = 1e-9
 """Tolerance of geometric comparisons [m]: a part may touch the case or the gel."""
 
@@ -29,7 +32,8 @@ def validate_sensor(sensor: SensorSpec) -> None:
     Files and every specification of a ``TactileSensor`` or a world go through it.
 
     Raises:
-        SpecError: the dome is deeper than the pad; the camera lies in the gel, outside the case, or sees past the pad; its
+        SpecError: the dome is deeper than the pad, or a map of its surface does not cover the pad, rises above the case, or falls below
+            the bonded face; the camera lies in the gel, outside the case, or sees past the pad; its
             distortion has no inverse, or its tilt is too large; the vignette leaves no light; colour shading has a wrong number of
             coefficients or might overflow; markers lie off the pad; an LED lies in the gel, above the dome, or outside the case, a
             virtual one above the dome, in the camera's view or where light refracts; with ``refraction.model = "slab"``, camera or LED do
@@ -65,6 +69,9 @@ def check_slab(sensor: SensorSpec) -> None:
 def _check_dome(sensor: SensorSpec) -> None:
     pad = sensor.gelpad
     half = (pad.size[0] / 2, pad.size[1] / 2)
+    if pad.surface is not None:
+        _check_surface(sensor, pad.surface)
+        return
     if any(radius <= extent for radius, extent in zip(pad.dome_radius, half, strict=True)):
         rule = f"must be more than half the pad, {in_mm(half)} mm; inf is flat"
         raise _error(sensor, "gelpad.dome_radius_mm", in_mm(pad.dome_radius), rule)
@@ -72,6 +79,37 @@ def _check_dome(sensor: SensorSpec) -> None:
     if depth >= pad.thickness:
         rule = f"the dome falls {depth * 1e3:.4g} mm at the corner: must be less than the thickness {pad.thickness * 1e3:.4g} mm"
         raise _error(sensor, "gelpad.dome_radius_mm", in_mm(pad.dome_radius), rule)
+
+
+def _check_surface(sensor: SensorSpec, surface: HeightMap) -> None:
+    """A map covers the pad and stays between the bonded face and the case's rim."""
+    pad = sensor.gelpad
+    if any(math.isfinite(radius) for radius in pad.dome_radius):
+        raise _error(sensor, "gelpad.dome_radius_mm", in_mm(pad.dome_radius), "must be left out where surface gives the shape")
+    if any(half < side / 2 - _SLACK for half, side in zip(surface.half, pad.size, strict=True)):
+        extent = in_mm(tuple(2.0 * half for half in surface.half))
+        rule = f"the map covers {extent} mm: must cover the pad of {in_mm(pad.size)} mm"
+        raise _error(sensor, "gelpad.surface_pitch_mm", in_mm(surface.spacing), rule)
+    x, y = (np.linspace(-side / 2, side / 2, count) for side, count in zip(pad.size, _samples(pad.size, surface), strict=True))
+    z = surface.height(x[None, :], y[:, None])
+    middle = float(surface.height(0.0, 0.0))
+    if abs(middle) > _SLACK:
+        rule = f"must be 0 in the middle of the pad, not {middle * 1e3:.4g} mm: HeightMap.centred makes it so"
+        raise _error(sensor, "gelpad.surface", surface, rule)
+    for value, bad, rule in (
+        (z.min(), z.min() <= -pad.thickness, f"must stay above the bonded face, z > {-pad.thickness * 1e3:.4g} mm"),
+        (z.max(), z.max() > _HIGHEST * pad.thickness, f"the case ends there: z <= {_HIGHEST * pad.thickness * 1e3:.4g} mm"),
+    ):
+        if bad:
+            row, column = np.argwhere(z == value)[0]
+            place = f"at x = {x[column] * 1e3:.4g}, y = {y[row] * 1e3:.4g} mm the surface is at z = {value * 1e3:.4g} mm"
+            raise _error(sensor, "gelpad.surface", surface, f"{place}, with 0 in the middle: {rule}")
+
+
+def _samples(size: tuple[float, float], surface: HeightMap) -> tuple[int, int]:
+    """Places to look at along x and y: as far apart as the nodes of a map, at most."""
+    nx, ny = (math.ceil(side / step) + 1 for side, step in zip(size, surface.spacing, strict=True))
+    return nx, ny
 
 
 def _check_camera_behind(sensor: SensorSpec) -> None:
@@ -219,12 +257,12 @@ def _check_led(sensor: SensorSpec, index: int, led: LedSpec) -> None:
     if led.virtual:
         _check_virtual(sensor, index, led)
     for x, y, z in (led.position, *led_corners(led)):
-        rest = -pad.sag(min(abs(x), half_x), min(abs(y), half_y))
+        rest = -float(pad.sag(min(max(x, -half_x), half_x), min(max(y, -half_y), half_y)))
         if not led.virtual and abs(x) <= half_x and abs(y) <= half_y and z > -back + _SLACK:
             rule = f" lies inside the gel: under the pad all of it must have z <= {-back * 1e3:.4g} mm"
         elif z > rest + _SLACK:
             rule = (
-                f" lies above the dome: {'all' if led.virtual else 'beside the pad all'} of it must have z <= {rest * 1e3:.4g} mm"
+                f" lies above the gel: {'all' if led.virtual else 'beside the pad all'} of it must have z <= {rest * 1e3:.4g} mm"
             )
         elif not _in_case(sensor, (x, y, z)):
             rule = f", {in_mm(led.size)} mm large, must lie inside the case, {_case_rule(sensor)}"

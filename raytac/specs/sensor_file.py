@@ -10,11 +10,14 @@ from typing import Any
 
 from raytac.errors import InputError
 from raytac.specs.files import available, find_file, name_of
+from raytac.specs.height_map import HeightMap, read_height_map
 from raytac.specs.marker_motion import MarkerMotionSpec, load_marker_motion, marker_motion_text
 from raytac.specs.sensor import (
     LED_SCHEMA,
     SENSOR_PARTS,
     SENSOR_SCHEMA,
+    SURFACE_SCHEMA,
+    GelpadSpec,
     LedSpec,
     LightsSpec,
     ResponseSpec,
@@ -22,7 +25,7 @@ from raytac.specs.sensor import (
     shading_degree,
 )
 from raytac.specs.sensor_check import validate_sensor
-from raytac.specs.toml import Table, Text, read_toml, split_unit
+from raytac.specs.toml import Number, Table, Text, read_toml, split_unit
 
 _LONGEST_CHAIN = 32
 """Files that a sensor can be built on, one after the other."""
@@ -74,13 +77,30 @@ def _read_sensor(path: Path, above: tuple[Path, ...] = ()) -> SensorSpec:
         schema["lights"] = Text(default="")
     head = top.read(schema, sections=tuple(parts))
     given = [name for name in parts if name in top.data or (base is None and name not in _MAY_LACK)]
-    changes: dict[str, Any] = {name: SENSOR_PARTS[name](**top.section(name).read(parts[name])) for name in given}
+    changes: dict[str, Any] = {
+        name: _read_gelpad(top.section(name)) if name == "gelpad" else SENSOR_PARTS[name](**top.section(name).read(parts[name]))
+        for name in given
+    }
     if head["lights"]:
         changes["lights"] = _read_lights(find_file("lights", head["lights"], base=path.parent))
     if head["marker_motion"]:
         changes["marker_motion"] = load_marker_motion(head["marker_motion"], base=path.parent)
     changes |= {"name": name_of(path), "source": path}
     return _valid(SensorSpec(**changes) if base is None else replace(base, **changes))
+
+
+def _read_gelpad(table: Table) -> GelpadSpec:
+    """The gelpad, with the surface of the file that it names in place of a dome."""
+    schema = dict(SENSOR_SCHEMA["gelpad"])
+    for key in [key for key in SURFACE_SCHEMA if key in table.data]:
+        if "surface" not in table.data:
+            raise table.error("is of a surface that no key names: surface = a file", key, table.data[key])
+    if "surface" not in table.data:
+        return GelpadSpec(**table.read(schema))
+    schema["dome_radius_mm"] = Number("[1, inf]", length=2, default=(math.inf, math.inf))
+    values = table.read({**schema, **SURFACE_SCHEMA})
+    name, unit, pitch = values.pop("surface"), values.pop("surface_unit"), values.pop("surface_pitch")
+    return GelpadSpec(**values, surface=read_height_map(table.file.parent / Path(name).expanduser(), unit, pitch, values["size"]))
 
 
 def load_lights(name_or_path: str | Path) -> LightsSpec:
@@ -173,7 +193,7 @@ def response_text(response: ResponseSpec) -> str:
     return "\n".join(lines) + "\n"
 
 
-_MOTION = "marker_motion.toml"
+_MOTION, _SURFACE = "marker_motion.toml", "surface.csv"
 
 
 def sensor_files(sensor: SensorSpec) -> dict[str, str]:
@@ -181,7 +201,7 @@ def sensor_files(sensor: SensorSpec) -> dict[str, str]:
 
     Its lights are in a ``lights.toml`` beside it, which is not among them. A sensor whose lights, response, optics and noise are all that
     it does not have from a shipped one names that as its base; any other holds every table itself. Markers' motion is a shipped name or a
-    file beside it. No path of this machine is in it.
+    file beside it, the map of a pad's surface a file beside it. No path of this machine is in it.
     """
     files: dict[str, str] = {}
     base = _shipped_base(sensor)
@@ -194,6 +214,8 @@ def sensor_files(sensor: SensorSpec) -> dict[str, str]:
         head.append(f'marker_motion = "{shipped or _MOTION}"')
         if shipped is None:
             files[_MOTION] = marker_motion_text(sensor.marker_motion)
+    if base is None and sensor.gelpad.surface is not None:
+        files[_SURFACE] = _map_text(sensor.gelpad.surface)
     blocks = [response_text(sensor.response) if name == "response" else _table(sensor, name) for name in tables]
     return {"sensor.toml": "\n".join(["\n".join(head) + "\n", *blocks])} | files
 
@@ -232,4 +254,12 @@ def _table(sensor: SensorSpec, name: str) -> str:
 
         written = f"[{', '.join(text(one) for one in value)}]" if isinstance(value, tuple) else text(value)
         lines.append(f"{key} = {written}")
+    if name == "gelpad" and sensor.gelpad.surface is not None:  # in metres, so that numbers come back equal
+        dx, dy = (f"{1e3 * step:.15g}" for step in sensor.gelpad.surface.spacing)
+        lines += [f'surface = "{_SURFACE}"', "surface_unit_mm = 1000", f"surface_pitch_mm = [{dx}, {dy}]"]
     return "\n".join(lines) + "\n"
+
+
+def _map_text(surface: HeightMap) -> str:
+    """Heights [m] as a table, a line a row."""
+    return "".join(",".join(f"{value:.17g}" for value in row) + "\n" for row in surface.heights)

@@ -117,7 +117,7 @@ def test_a_sensor_takes_virtual_sources_beside_the_view_alone(mini: SensorSpec, 
     seen = dataclasses.replace(inside, lights=LightsSpec((dataclasses.replace(led, position=(0.5 * (low + high), 0.0, -2e-3)),)))
     with pytest.raises(SpecError, match=r"must lie beside the camera.s view, x = -10\.14"):
         validate_sensor(seen)
-    with pytest.raises(SpecError, match="above the dome"):
+    with pytest.raises(SpecError, match="above the gel"):
         validate_sensor(moved_to(mini, 0.5))
     slab = dataclasses.replace(moved_to(mini, -9.0), refraction=dataclasses.replace(mini.refraction, model="slab"))
     with pytest.raises(SpecError, match=r"refraction\.model must be 'none'"):

@@ -20,6 +20,7 @@ SAYS = {
     "foreign_robosuite": "left: pad pressed by 3.0",
     "gym_env": "return after five random actions",
     "own_mujoco_model": "right: normal force",
+    "own_pad_shape": "bent: touches",
     "own_part": "leaning: touches at x = ",
     "own_vector_env": "force on each cube",
     "press": "force",

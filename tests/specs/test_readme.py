@@ -10,7 +10,7 @@ import pytest
 
 from raytac.assets import asset_root
 from raytac.specs.press import POSE_SCHEMA, SCENE_SCHEMA, STAGE_SCHEMA
-from raytac.specs.sensor import LED_SCHEMA, SENSOR_SCHEMA
+from raytac.specs.sensor import LED_SCHEMA, SENSOR_SCHEMA, SURFACE_SCHEMA
 from raytac.specs.shape_file import OBJECT_SCHEMA
 from raytac.specs.toml import ANY, Flag, Integer, Number, Schema, Text
 
@@ -42,7 +42,7 @@ def row(text: str, key: str) -> str:
 @pytest.mark.parametrize("table", [name for name in SENSOR_SCHEMA if name])
 def test_sensor_keys(table: str) -> None:
     text = section("Sensor").split(f"**`[{table}]`**")[1].split("| **`[")[0]
-    for key, interval in ranged(SENSOR_SCHEMA[table]):
+    for key, interval in ranged({**SENSOR_SCHEMA[table], **(SURFACE_SCHEMA if table == "gelpad" else {})}):
         assert interval in row(text, key)
 
 

@@ -211,8 +211,8 @@ def test_marker_errors(make_sensor: MakeSensor, change: dict[str, Any], key: str
 LED_ERRORS: list[tuple[str, Any, str]] = [
     ("led[1].position_mm", [5.0, 0.0, -2.0], "LED 'green' lies inside the gel: under the pad all of it must have z <= -4 mm"),
     ("led[1].position_mm", [0.0, 0.0, 5.0], "lies inside the gel"),
-    ("led[1].position_mm", [14.2, 5.0, 1.0], "LED 'green' lies above the dome"),
-    ("led[1].position_mm", [14.2, 5.0, -0.2], "lies above the dome"),
+    ("led[1].position_mm", [14.2, 5.0, 1.0], "LED 'green' lies above the gel"),
+    ("led[1].position_mm", [14.2, 5.0, -0.2], "lies above the gel"),
     ("led[1].position_mm", [16.0, 5.0, -8.0], "LED 'green', [2.0, 1.0] mm large, must lie inside the case, |x| <= 15.2 mm"),
     ("led[1].position_mm", [0.0, -13.5, -8.0], "must lie inside the case"),
     ("led[1].position_mm", [0.0, 0.0, -30.0], "must lie inside the case"),

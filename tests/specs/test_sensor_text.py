@@ -34,11 +34,20 @@ def test_a_shipped_sensor_is_named_as_base_and_another_is_written_as_a_whole(nam
     for other in (
         replace(sensor, source=None),
         replace(sensor, coat=replace(sensor.coat, roughness=0.123456789)),
-        replace(sensor, gelpad=replace(sensor.gelpad, dome_radius=(float("inf"), 0.1), bonded="back_and_sides")),
+        replace(sensor, gelpad=replace(sensor.gelpad, dome_radius=(float("inf"), 0.1), surface=None, bonded="back_and_sides")),
     ):
         text = sensor_files(other)["sensor.toml"]
         assert "base" not in text.split("[gelpad]")[0] and str(tmp_path) not in text
         assert same(other, written(other, tmp_path / f"whole{id(other)}"))
+
+
+def test_the_map_of_a_pads_surface_goes_along(tmp_path: Path) -> None:
+    finger = load_sensor("finger_example")
+    assert sensor_files(finger).keys() == {"sensor.toml"}
+    alone = replace(finger, source=None)
+    assert sensor_files(alone).keys() == {"sensor.toml", "surface.csv"}
+    back = written(alone, tmp_path / "whole")
+    assert same(alone, back) and back.gelpad.surface == finger.gelpad.surface
 
 
 def test_marker_motion_of_ones_own_goes_along(tmp_path: Path) -> None:

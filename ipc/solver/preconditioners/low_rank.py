@@ -60,7 +60,9 @@ class Small:
 
     ``touched``, ``slot`` (B, s): mark of a surface node that touches, and its place among the contact nodes.
     ``count`` (B,): contact nodes; more than m do not fit.    ``pads`` (B,): those of pads, the first ones.    ``node`` (B, m).
-    ``a`` (B, m, m): S, then (K + S)⁻¹.    ``k`` (B, m, m): K.    ``product`` (B, m, m), ``row``, ``column`` (B, m): work space.
+    ``known`` (B,): pad nodes of which ``k`` is K; −1 after ``node`` has changed.
+    ``a`` (B, m, m): the upper half of S, then (K + S)⁻¹.    ``k`` (B, m, m): K.
+    ``product`` (B, m, m), ``row``, ``column`` (B, m): work space.
     ``w`` (B, 3m, 3m): W [N/m].
     ``t``, ``force`` (B, 3m): J K_0⁻¹ r [m], on affine nodes L⁻¹ r, and W t [N].
     ``root`` (B, A, 4): blocks of an affine node's row of L⁻¹, at the nodes of its body.
@@ -71,6 +73,7 @@ class Small:
     count: IntArray
     pads: IntArray
     node: IntArray2d
+    known: IntArray
     a: wp.array3d(dtype=wp.mat33d)
     k: wp.array3d(dtype=wp.mat33d)
     product: wp.array3d(dtype=wp.mat33d)
@@ -148,7 +151,17 @@ def place_contacts(rest: Rest, active: IntArray, small: Small):
         place += small.touched[env, other]
     small.slot[env, s] = place
     if place < small.node.shape[1]:
+        if small.node[env, place] != rest.surface_node[s]:
+            small.known[env] = -1
         small.node[env, place] = rest.surface_node[s]
+
+
+@wp.kernel
+def mark_full(active: IntArray, small: Small, full: IntArray):
+    env = wp.tid()
+    full[env] = 0
+    if active[env] != 0 and not fits(small, env):
+        full[env] = 1
 
 
 @wp.func
@@ -179,67 +192,90 @@ def scaled_part(
 
 
 @wp.func
-def add_between(env: wp.int32, small: Small, a: wp.int32, g: mat34d, b: wp.int32, h: mat34d):
-    """S += g hᵀ between the nodes of two affine bodies, or of one."""
+def add_product(env: wp.int32, small: Small, i: wp.int32, q: wp.vec3d, a: wp.int32, g: mat34d):
+    """S += q gᵀ between a node's unknowns and the nodes of an affine body, which come after it."""
     for m in range(4):
-        for n in range(4):
-            wp.atomic_add(small.a, env, a + m, b + n, wp.outer(row_column(g, m), row_column(h, n)))
+        wp.atomic_add(small.a, env, i, a + m, wp.outer(q, row_column(g, m)))
 
 
 @wp.func
-def add_beside(env: wp.int32, small: Small, i: wp.int32, q: wp.vec3d, a: wp.int32, g: mat34d):
-    """S += q gᵀ + g qᵀ between a contact node and the nodes of an affine body."""
-    for m in range(4):
-        block = wp.outer(q, row_column(g, m))
-        wp.atomic_add(small.a, env, i, a + m, block)
-        wp.atomic_add(small.a, env, a + m, i, wp.transpose(block))
-
-
-@wp.func
-def add_row(env: wp.int32, system: SystemView, verts: wp.vec4i, row: mat34d, rest: Rest, small: Small):
-    """S += q qᵀ between the contact nodes, in the frames of their bodies."""
-    one = affine_first(system, verts, -1)
-    a, b = slot_of(env, rest, small, one), wp.int32(-1)
-    g, h = mat34d(), mat34d()
+def add_own(env: wp.int32, small: Small, a: wp.int32, blocks: mat1212d):
+    """S += the upper half of Σ g gᵀ of an affine body in slot a; −1 for none."""
     if a >= 0:
-        g = scaled_part(system, verts, row, env, rest, small, one)
-        add_between(env, small, a, g, a, g)
-    if one >= 0:
-        other = affine_first(system, verts, one)
-        b = slot_of(env, rest, small, other)
-        if b >= 0:
-            h = scaled_part(system, verts, row, env, rest, small, other)
-            add_between(env, small, b, h, b, h)
-            if a >= 0:
-                add_between(env, small, a, g, b, h)
-                add_between(env, small, b, h, a, g)
-    for k in range(4):
-        s = surface_of_vertex(system, rest, verts[k])
-        if s >= 0:
-            qi = wp.transpose(system.R[env, system.verts.body[verts[k]]]) * row_column(row, k)
-            if wp.length_sq(qi) > wp.float64(0.0):
-                i = small.slot[env, s]
-                for m in range(4):
-                    other_s = surface_of_vertex(system, rest, verts[m])
-                    if other_s >= 0:
-                        qj = wp.transpose(system.R[env, system.verts.body[verts[m]]]) * row_column(row, m)
-                        if wp.length_sq(qj) > wp.float64(0.0):
-                            wp.atomic_add(small.a, env, i, small.slot[env, other_s], wp.outer(qi, qj))
-                if a >= 0:
-                    add_beside(env, small, i, qi, a, g)
-                if b >= 0:
-                    add_beside(env, small, i, qi, b, h)
+        for m in range(4):
+            for n in range(m, 4):
+                block = wp.mat33d()
+                for i in range(3):
+                    for j in range(3):
+                        block[i, j] = blocks[3 * m + i, 3 * n + j]
+                wp.atomic_add(small.a, env, a + m, a + n, block)
+
+
+@wp.func
+def own_product(g: mat34d) -> mat1212d:
+    """The upper half of g gᵀ."""
+    blocks = mat1212d()
+    for m in range(4):
+        for n in range(m, 4):
+            for i in range(3):
+                for j in range(3):
+                    blocks[3 * m + i, 3 * n + j] = g[i, m] * g[j, n]
+    return blocks
 
 
 @wp.kernel
 def add_rows(system: SystemView, contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
-    """S = Σ q qᵀ."""
+    """The upper half of S = Σ q qᵀ between the contact nodes, in the frames of their bodies.
+
+    A thread sums what its rows give to one affine body, to which nearly all of them belong, and adds that at once.
+    """
     env, lane = wp.tid()
     if active[env] == 0 or not fits(small, env):
         return
+    place, own = wp.int32(-1), mat1212d()
     for r in range(lane, rows_of(contacts, env), lanes):
-        if contacts.concave[env, r] == 0:
-            add_row(env, system, contacts.row_verts[env, r], contacts.row[env, r], rest, small)
+        if contacts.concave[env, r] != 0:
+            continue
+        verts, row = contacts.row_verts[env, r], contacts.row[env, r]
+        one, other = affine_first(system, verts, -1), wp.int32(-1)
+        if one >= 0:
+            other = affine_first(system, verts, one)
+        a, b = slot_of(env, rest, small, one), slot_of(env, rest, small, other)
+        if a < 0:
+            one, a, b = other, b, wp.int32(-1)
+        g, h = mat34d(), mat34d()
+        if a >= 0:
+            g = scaled_part(system, verts, row, env, rest, small, one)
+            if a != place:
+                add_own(env, small, place, own)
+                place, own = a, mat1212d()
+            own += own_product(g)
+        if b >= 0:
+            h = scaled_part(system, verts, row, env, rest, small, other)
+            add_own(env, small, b, own_product(h))
+            for m in range(4):
+                if a < b:
+                    add_product(env, small, a + m, row_column(g, m), b, h)
+                else:
+                    add_product(env, small, b + m, row_column(h, m), a, g)
+        for k in range(4):
+            s = surface_of_vertex(system, rest, verts[k])
+            if s >= 0:
+                qi = wp.transpose(system.R[env, system.verts.body[verts[k]]]) * row_column(row, k)
+                if wp.length_sq(qi) > wp.float64(0.0):
+                    i = small.slot[env, s]
+                    for m in range(4):
+                        other_s = surface_of_vertex(system, rest, verts[m])
+                        if other_s >= 0:
+                            j = small.slot[env, other_s]
+                            if i <= j:
+                                qj = wp.transpose(system.R[env, system.verts.body[verts[m]]]) * row_column(row, m)
+                                wp.atomic_add(small.a, env, i, j, wp.outer(qi, qj))
+                    if a >= 0:
+                        add_product(env, small, i, qi, a, g)
+                    if b >= 0:
+                        add_product(env, small, i, qi, b, h)
+    add_own(env, small, place, own)
 
 
 @wp.func
@@ -353,21 +389,31 @@ def factor_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
     if active[env] == 0 or not fits(small, env):
         return
     m, pads = small.count[env], small.pads[env]
+    known = small.known[env] == pads
     for e in range(lane, m * m, lanes):
         i = e / m
         j = e - m * i
         if i < pads and j < pads:
-            small.k[env, i, j] = rest_block(rest, small.node[env, i], small.node[env, j])
+            if not known:
+                small.k[env, i, j] = rest_block(rest, small.node[env, i], small.node[env, j])
         elif i == j:
             small.k[env, i, j] = wp.identity(n=3, dtype=wp.float64)
         else:
             small.k[env, i, j] = wp.mat33d()
-    good = invert_small(small.k, small, env, pads, lane, lanes)
+    good = wp.bool(True)
+    if not known:
+        good = invert_small(small.k, small, env, pads, lane, lanes)
+    wait_for_block()
+    if lane == 0:
+        small.known[env] = pads
     if good:
         for e in range(lane, m * m, lanes):
             i = e / m
             j = e - m * i
-            small.a[env, i, j] = small.a[env, i, j] + small.k[env, i, j]
+            if i <= j:
+                T = small.a[env, i, j] + small.k[env, i, j]
+                small.a[env, i, j] = T
+                small.a[env, j, i] = wp.transpose(T)
         good = invert_small(small.a, small, env, m, lane, lanes)
     wait_for_block()
     if good:
@@ -390,15 +436,18 @@ def factor_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
         for e in range(lane, m * m, lanes):
             i = e / m
             j = e - m * i
-            W = small.k[env, i, j]
-            for n in range(m):
-                W -= small.product[env, i, n] * small.k[env, n, j]
-            for p in range(3):
-                for q in range(3):
-                    small.w[env, 3 * i + p, 3 * j + q] = W[p, q]
+            if i <= j:
+                W = small.k[env, i, j]
+                for n in range(m):
+                    W -= small.product[env, i, n] * small.k[env, n, j]
+                for p in range(3):
+                    for q in range(3):
+                        small.w[env, 3 * i + p, 3 * j + q] = W[p, q]
+                        small.w[env, 3 * j + q, 3 * i + p] = W[p, q]
     elif lane == 0:
         # Something is not finite: without contacts it is still a preconditioner.
         small.count[env] = 0
+        small.known[env] = -1
     wait_for_block()
     for e in range(lane, m * m, lanes):
         small.a[env, e / m, e % m] = wp.mat33d()
@@ -495,27 +544,35 @@ class LowRank:
         small.touched, small.slot = zeros(batch, nodes, dtype=wp.int32), zeros(batch, nodes, dtype=wp.int32)
         small.count, small.pads = zeros(batch, dtype=wp.int32), zeros(batch, dtype=wp.int32)
         small.node = zeros(batch, room, dtype=wp.int32)
+        small.known = wp.full(batch, -1, dtype=wp.int32, device=device)
         small.a, small.k, small.product = (zeros(batch, room, room, dtype=wp.mat33d) for _ in range(3))
         small.row, small.column = zeros(batch, room, dtype=wp.mat33d), zeros(batch, room, dtype=wp.mat33d)
         small.w = zeros(batch, 3 * room, 3 * room, dtype=wp.float64)
         small.t, small.force = zeros(batch, 3 * room, dtype=wp.float64), zeros(batch, 3 * room, dtype=wp.float64)
         self.bodies = len(rest.affine_node) // 4
         small.root = zeros(batch, 4 * self.bodies, 4, dtype=wp.mat33d)
-        self.small = small
+        self.small, self.full = small, zeros(batch, dtype=wp.int32)
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, block_dim: int = 256) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block_dim)
 
-    def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
-        """Take in the affine bodies and the rows of the active environments."""
+    def find_contacts(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
+        """Number the contact nodes of the active environments; ``full`` (B,) is 1 where there is no room for them."""
         rest, small = self.rest, self.small
-        if self.bodies:
-            self._launch(factor_affine, (self.batch, self.bodies), [rest, system, active, small])
         self._launch(forget_contacts, small.touched.shape, [active, small])
         if rows:
             inputs = [system, contacts, rest, active, self.row_lanes, small]
             self._launch(mark_contacts, (self.batch, self.row_lanes), inputs)
             self._launch(place_contacts, small.touched.shape, [rest, active, small])
+        self._launch(mark_full, self.batch, [active, small, self.full])
+
+    def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
+        """Take in the affine bodies and the rows of the active environments, whose contact nodes are numbered."""
+        rest, small = self.rest, self.small
+        if self.bodies:
+            self._launch(factor_affine, (self.batch, self.bodies), [rest, system, active, small])
+        if rows:
+            inputs = [system, contacts, rest, active, self.row_lanes, small]
             self._launch(add_rows, (self.batch, self.row_lanes), inputs)
             self._launch(factor_small, (self.batch, self.lanes), [rest, active, self.lanes, small], self.lanes)
 

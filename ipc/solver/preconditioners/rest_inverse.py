@@ -325,6 +325,8 @@ class RestInverse:
         ]
         self._lay_out_patches([patch for body in bodies for patch in body.patches], count)
         self.jacobi = BlockJacobi(layout, batch, lanes, device)
+        self._free = bool(np.any((layout.node_free != 0) & (part < 0) & (affine < 0) & (self._inner < 0)))
+        """Some unknowns, those of free soft bodies, always have block-Jacobi."""
 
     def _vectors(self, inputs: int, outputs: int) -> tuple[wp.array, wp.array]:
         """Padded inputs (B, inputs) and parts of outputs (parts, B, outputs) of a product."""
@@ -359,7 +361,7 @@ class RestInverse:
         twin_start = np.concatenate([[0], np.cumsum(np.bincount(nodes, minlength=count))])
         twin_out, twin_in = (np.concatenate([np.zeros(0, int), *places])[order] for places in (outs, ins))
         places = {"unknown": unknown, "patch_out": patch_out, "twin_start": twin_start, "twin_out": twin_out, "twin_in": twin_in}
-        self.inside = filled(Inside, self.device, places)
+        self.inside, self._inner = filled(Inside, self.device, places), unknown
         self.patched = bool(patches)
         self.x_inside, self.y_inside = self._vectors(len(patches) * inner, len(patches) * (inner + border))
         self.x_back, self.y_back = self._vectors(len(patches) * border, len(patches) * inner)
@@ -372,8 +374,9 @@ class RestInverse:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
-        """Take in the contacts of the active environments, and the diagonal of their matrix."""
-        self.jacobi.update(system, contacts, rows, active)
+        """Take in the contacts of the active environments, and the diagonal of their matrix where it is used."""
+        self.low_rank.find_contacts(system, contacts, rows, active)
+        self.jacobi.update(system, contacts, rows, active if self._free else self.low_rank.full)
         self.low_rank.update(system, contacts, rows, active)
 
     def apply(self, r: wp.array, running: wp.array, z: wp.array) -> None:

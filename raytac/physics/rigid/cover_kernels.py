@@ -17,9 +17,10 @@ from __future__ import annotations
 
 import warp as wp
 
+from raytac.physics.rest_map import RestMaps
 from raytac.physics.rigid.law_kernels import NODE, Sums, add_node
 from raytac.physics.rigid.node_kernels import total_of
-from raytac.physics.rigid.placed_kernels import Pads, Placed, across, entries_of, larger, smaller, under
+from raytac.physics.rigid.placed_kernels import Pads, Placed, across, entries_of, larger, rest_of, smaller, under
 from raytac.physics.rigid.shape_kernels import BOX, CYLINDER, Shapes, infinity
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -45,6 +46,8 @@ class Outline:
 
     lines: wp.array(dtype=wp.vec3d)
     """Of ``Pads``."""
+    maps: RestMaps
+    pad: wp.int32
     x: wp.int32
     """Index of the window's first node in ``lines``."""
     y: wp.int32
@@ -63,7 +66,7 @@ class Outline:
 def place_of(outline: Outline, i: wp.int32, j: wp.int32) -> wp.vec3d:
     """x, y and height of the resting gel at a node of the window [m]."""
     x, y = outline.lines[outline.x + i], outline.lines[outline.y + j]
-    return wp.vec3d(x[0], y[0], x[1] + y[1])
+    return wp.vec3d(x[0], y[0], rest_of(outline.maps, outline.pad, x, y)[0])
 
 
 @wp.func
@@ -243,6 +246,8 @@ def add_outline(
     last_x, last_y = pads.nx[pad, level] - 1, pads.ny[pad, level] - 1
     outline = Outline()
     outline.lines = pads.lines
+    outline.maps = pads.maps
+    outline.pad = pad
     outline.x = pads.first_x[pad, level] + i0
     outline.y = pads.first_y[pad, level] + j0
     outline.below = below

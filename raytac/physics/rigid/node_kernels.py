@@ -11,7 +11,8 @@ from typing import Any
 
 import warp as wp
 
-from raytac.physics.rigid.placed_kernels import Pads, Placed, across, larger, smaller, under, window
+from raytac.physics.rest_map import RestMaps, rest_on_map
+from raytac.physics.rigid.placed_kernels import Pads, Placed, across, larger, rest_of, smaller, under, window
 from raytac.physics.rigid.shape_kernels import Shapes, infinity
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -80,6 +81,8 @@ def height_at(
     z = under(shapes, placed, block, x[0], y[0], False)
     if z < -pads.thickness[pad]:
         return wp.vec2d(_INF, _INF)
+    if pads.maps.first[pad] >= 0:
+        return wp.vec2d(z, z - rest_of(pads.maps, pad, x, y)[0])
     return wp.vec2d(z, z - x[1] - y[1])
 
 
@@ -123,7 +126,7 @@ def between_nodes(
 @wp.func
 def look_at_nodes(
     gap: wp.array(dtype=wp.float64), lines: wp.array(dtype=wp.vec3d), first_x: wp.int32, first_y: wp.int32, lane: wp.int32, nx: wp.int32,
-    ny: wp.int32, bond: wp.float64, below: wp.float64,
+    ny: wp.int32, bond: wp.float64, below: wp.float64, maps: RestMaps, pad: wp.int32,
 ):  # fmt: skip
     """Turn a thread's heights on ny rows of nx nodes into gaps to the gel.
 
@@ -132,6 +135,7 @@ def look_at_nodes(
     """
     count, near_node, low_node = wp.int32(0), wp.int32(_MANY), wp.int32(_MANY)
     least, low = infinity(), infinity()
+    mapped = maps.first[pad] >= 0
     j = lane // across()
     while j < ny:
         rest = lines[first_y + j][1] + _0
@@ -142,6 +146,8 @@ def look_at_nodes(
             if z < bond:
                 z = _INF
             distance = z - lines[first_x + i][1] - rest
+            if mapped:
+                distance = z - rest_on_map(maps, pad, lines[first_x + i][0], lines[first_y + j][0])[0]
             if z < low:
                 low = z
                 low_node = k
@@ -308,8 +314,13 @@ def nodes_in(
 
 
 @wp.func
-def is_convex(shapes: Shapes, placed: Placed, block: wp.int32) -> wp.bool:
-    """True if one convex part alone is near: its gap to the resting gel, a cap, is convex."""
+def is_convex(shapes: Shapes, pads: Pads, placed: Placed, block: wp.int32, pad: wp.int32) -> wp.bool:
+    """True if one convex part alone is near: its gap to the resting gel, a cap, is convex.
+
+    A map of heights may be of any shape.
+    """
+    if pads.maps.first[pad] >= 0:
+        return False
     parts, convex = wp.int32(0), wp.int32(1)
     for k in range(placed.count[block]):
         if placed.part[block, k] >= 0:

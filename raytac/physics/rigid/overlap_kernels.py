@@ -16,7 +16,7 @@ from raytac.physics.rigid.contact_rows import LAST, Rows
 from raytac.physics.rigid.cover_kernels import add_outline
 from raytac.physics.rigid.law_kernels import NODE, Bins, add_node, clear_bins, crossings_at, deepest_of, tabulate
 from raytac.physics.rigid.node_kernels import between_nodes, least_of, total_of
-from raytac.physics.rigid.placed_kernels import Pads, Placed, across, larger
+from raytac.physics.rigid.placed_kernels import Pads, Placed, across, larger, rest_of
 from raytac.physics.rigid.shape_kernels import Shapes, infinity
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -90,9 +90,10 @@ def place_of_gap(pads: Pads, pad: wp.int32, touch: Touch, row: wp.int32, rows: R
     j = wp.int32(wp.round((y - pads.lines[fy][0]) / (pads.lines[fy + 1][0] - pads.lines[fy][0])))
     p = pads.lines[fx + wp.clamp(i, 0, pads.nx[pad, _LAST] - 1)]
     q = pads.lines[fy + wp.clamp(j, 0, pads.ny[pad, _LAST] - 1)]
-    rest = p[1] + p[2] * (x - p[0]) + q[1] + q[2] * (y - q[0])
+    node = rest_of(pads.maps, pad, p, q)
+    rest = node[0] + node[1] * (x - p[0]) + node[2] * (y - q[0])
     rows.centre[row] = wp.vec3d(x, y, rest - touch.depth)
-    rows.normal[row] = wp.normalize(wp.vec3d(-p[2], -q[2], wp.float64(1.0)))
+    rows.normal[row] = wp.normalize(wp.vec3d(-node[1], -node[2], wp.float64(1.0)))
 
 
 @wp.func
@@ -118,6 +119,7 @@ def fill_row(
     clear_bins(bins, block, lane, lanes)
     total_of(_0)
     last_x, last_y = pads.nx[pad, level] - 1, pads.ny[pad, level] - 1
+    mapped = pads.maps.first[pad] >= 0
     flat, below, sums = step_y / step_x, half - touch.depth, bins.sums[block]
     inverse, most = _1 / half, -infinity()
     j = lane // across()
@@ -134,6 +136,10 @@ def fill_row(
                 u = pads.lines[first_x + i0 + i] + wp.vec3d()
                 row_s += overlap
                 szz += overlap * overlap
+                if mapped:
+                    rest = rest_of(pads.maps, pad, u, v)
+                    u = wp.vec3d(u[0], rest[0], rest[1])
+                    sv += wp.vec3d(_0, _0, overlap * rest[2])
                 su += overlap * u
                 row_n += wp.float64(1.0)
                 row_x += u[0]

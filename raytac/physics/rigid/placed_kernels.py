@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from raytac.physics.rest_map import RestMaps, rest_on_map
 from raytac.physics.rigid.motion_kernels import place_of, turn_of
 from raytac.physics.rigid.shape_kernels import Shapes, first_hit, infinity, part_box, under_primitive, under_surface
 
@@ -44,7 +45,9 @@ class Pads:
     cell: wp.array2d(dtype=wp.float64)
     """Area of one node [m²]."""
     lines: wp.array(dtype=wp.vec3d)
-    """Place, height and slope of the resting gel, a function of x plus one of y (``sag``)."""
+    """Place, height and slope of the resting gel, a function of x plus one of y (``sag``).
+    Of a pad with a map of heights they are 0: ``maps`` has them."""
+    maps: RestMaps
     law: wp.array2d(dtype=wp.float64)
     """Constants of the load law (pads, n), see ``law_kernels``."""
 
@@ -69,6 +72,14 @@ class Placed:
     """Least width of the part as seen along z."""
     blunt: wp.array2d(dtype=wp.float64)
     """See ``Shapes``."""
+
+
+@wp.func
+def rest_of(maps: RestMaps, pad: wp.int32, x: wp.vec3d, y: wp.vec3d) -> wp.vec3d:
+    """z [m] and slopes along x and y of the resting gel at a node of two ``lines``."""
+    if maps.first[pad] >= 0:
+        return rest_on_map(maps, pad, x[0], y[0])
+    return wp.vec3d(x[1] + y[1], x[2], y[2])
 
 
 @wp.func

@@ -129,7 +129,7 @@ def measure_pair(
     # Nodes up to there are counted by the law.
     deeper = (_HALF * DEEPER - wp.float64(1.0)) * wp.min(highest - bottom, thickness)
     clear = wp.max(reach, deeper)
-    convex = is_convex(shapes, placed, block)
+    convex = is_convex(shapes, pads, placed, block, pad)
     last = wp.int32(_LAST)
     while last < _FINEST and pads.pitch[last] > wp.where(convex, _NARROW, _HALF) * width[0]:
         last += 1
@@ -168,7 +168,7 @@ def measure_pair(
             continue
         under_nodes(shapes, placed, block, lane, pads.lines, fx + i0, fy + j0, nx, ny, gaps)
         count, own_least, near_node, own_low, low_node = look_at_nodes(
-            gaps, pads.lines, fx + i0, fy + j0, lane, nx, ny, bond, zero
+            gaps, pads.lines, fx + i0, fy + j0, lane, nx, ny, bond, zero, pads.maps, pad
         )
         count = total_of(count)
         if mode == _LAW:

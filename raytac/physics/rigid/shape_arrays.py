@@ -10,6 +10,7 @@ import warp as wp
 
 from raytac.errors import InputError
 from raytac.gel.surface import make_grid
+from raytac.physics.rest_map import rest_maps
 from raytac.physics.rigid.layer_response import layer_response, reduced_modulus
 from raytac.physics.rigid.placed_kernels import Pads
 from raytac.physics.rigid.shape_kernels import Shapes
@@ -122,9 +123,10 @@ class PadArrays:
             for k, pitch in enumerate(pitches):
                 x, y = (np.linspace(-0.5 * size, 0.5 * size, round(size / pitch) + 1) for size in gelpad.size)
                 cell[p, k] = (x[1] - x[0]) * (y[1] - y[0])
+                separable = gelpad.surface is None
                 for first, count, line, rest in (
-                    (first_x, nx, x, -gelpad.sag(x, 0.0)),
-                    (first_y, ny, y, -gelpad.sag(0.0, y)),
+                    (first_x, nx, x, -gelpad.sag(x, 0.0) if separable else 0.0 * x),
+                    (first_y, ny, y, -gelpad.sag(0.0, y) if separable else 0.0 * y),
                 ):
                     first[p, k], count[p, k] = sum(map(len, lines)), len(line)
                     lines.append(np.stack([line, rest, np.gradient(rest, line)], axis=1))
@@ -142,6 +144,7 @@ class PadArrays:
         pads.first_y = wp.array(first_y, dtype=wp.int32, device=device)
         pads.cell = wp.array(cell, dtype=wp.float64, device=device)
         pads.lines = _array(np.concatenate(lines), wp.vec3d, device)
+        pads.maps = rest_maps(gelpads, device)
         pads.law = wp.array(np.array([_law(gelpad) for gelpad in gelpads]), dtype=wp.float64, device=device)
         self.struct = pads
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import warp as wp
 
+from raytac.physics.rest_map import RestMaps, rest_on_map
+
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _0 = wp.constant(wp.float64(0.0))
@@ -37,6 +39,8 @@ class Coat:
     lattice_y: wp.array(dtype=wp.float64)
     dome: wp.vec2d
     """Radii of the dome along x and y."""
+    maps: RestMaps
+    """The one map of heights in place of a dome, if there is one."""
 
 
 @wp.struct
@@ -59,9 +63,11 @@ def sagitta(u: wp.float64, radius: wp.float64) -> wp.float64:
 
 
 @wp.func
-def rest_at(dome: wp.vec2d, x: wp.float64, y: wp.float64) -> wp.float64:
+def rest_at(coat: Coat, x: wp.float64, y: wp.float64) -> wp.float64:
     """Rest surface z [m]."""
-    return -(sagitta(x, dome[0]) + sagitta(y, dome[1]))
+    if coat.maps.first[0] >= 0:
+        return rest_on_map(coat.maps, 0, x, y)[0]
+    return -(sagitta(x, coat.dome[0]) + sagitta(y, coat.dome[1]))
 
 
 @wp.func
@@ -177,7 +183,7 @@ def find_places(coat: Coat, fields: wp.array4d(dtype=wp.float64), places: Places
                 done = wp.int32(1)
         else:
             break
-    places.sag[env, p] = rest_at(coat.dome, on_pad(coat.lines_x, u), on_pad(coat.lines_y, v)) - rest_at(coat.dome, x, y)
+    places.sag[env, p] = rest_at(coat, on_pad(coat.lines_x, u), on_pad(coat.lines_y, v)) - rest_at(coat, x, y)
     places.corner[env, p] = corner
     places.along_x[env, p] = along_x
     places.along_y[env, p] = along_y

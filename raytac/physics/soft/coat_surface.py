@@ -10,6 +10,7 @@ import warp as wp
 from raytac.gel.coat_mesh import CoatMesh
 from raytac.gel.interpolate import SplineAxis
 from raytac.gel.products import Matrices, Products
+from raytac.physics.rest_map import rest_maps
 from raytac.physics.soft import coat_kernels as kernels
 from raytac.specs.sensor import GelpadSpec
 
@@ -43,6 +44,7 @@ class CoatSurface:
         for name, values in lines.items():
             setattr(coat, name, wp.array(values, dtype=wp.float64, device=self._device))
         coat.rest, coat.dome = wp.array(mesh.rest, dtype=wp.vec3d, device=self._device), wp.vec2d(*map(float, gelpad.dome_radius))
+        coat.maps = rest_maps([gelpad], self._device)
         self.struct = coat
         self.lattice = len(self._lattice_y.lines), len(self._lattice_x.lines)
         count, points = products.num_envs, self.lattice[0] * self.lattice[1]

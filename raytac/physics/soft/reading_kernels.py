@@ -106,7 +106,7 @@ def place_coat(
     x, y = coat.rest[v][0] + sideways[env, v], coat.rest[v][1] + sideways[env, count + v]
     # Beyond the pad's edge the height is that at the edge.
     at = wp.vec2d(on_pad(coat.lines_x, x), on_pad(coat.lines_y, y))
-    out[env, v] = wp.vec3d(x, y, rest_at(coat.dome, at[0], at[1]) + sampled(rise, env, lines, at))
+    out[env, v] = wp.vec3d(x, y, rest_at(coat, at[0], at[1]) + sampled(rise, env, lines, at))
 
 
 @wp.kernel
