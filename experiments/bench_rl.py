@@ -58,6 +58,7 @@ from raytac.errors import InputError, RaytacError
 from raytac.gel import ElasticSurround, GelSurface
 from raytac.io import CommonOptions, Metric, parse_names, parse_resolution, read_metrics, versions
 from raytac.observe import ObservationSettings, TactileObserver, as_tensors
+from raytac.physics import Ipc, SceneSettings
 from raytac.report import machine
 from raytac.sensor import TactileSensor
 from raytac.shapes import object_height, primitive
@@ -92,6 +93,10 @@ class Args(CommonOptions):
     """Of these images."""
     sensor: str = "gelsight_mini"
     """That makes them."""
+    tolerance: float | None = None
+    """With soft pads: longest move of a vertex in a solved step [m]; that of ``SceneSettings`` if not given."""
+    linear_tolerance: float | None = None
+    """With soft pads: relative residual of the last linear solve of a step."""
     engine: str = "auto"
     """``mujoco``: worlds on the CPU, images on ``--device``; ``mujoco_warp``: all on ``--device``; ``auto``: the latter on CUDA."""
     launches: int | None = None
@@ -153,7 +158,9 @@ def soft(args: Args) -> dict[str, Metric]:
 
 def timed_soft(tactile: ObservationSettings | None, args: Args) -> dict[str, Metric]:
     """Keys of one mode with soft pads."""
-    env = TASKS[args.task][1](args.envs, physics="ipc", tactile=tactile, seed=args.seed, device=args.device)
+    given = {name: getattr(args, name) for name in ("tolerance", "linear_tolerance") if getattr(args, name) is not None}
+    physics = Ipc(accuracy=SceneSettings(**given))
+    env = TASKS[args.task][1](args.envs, physics=physics, tactile=tactile, seed=args.seed, device=args.device)
     env.reset(seed=args.seed)
     rng, actions = np.random.default_rng(args.seed), env.single_action_space.shape[0]  # type: ignore[index]
     rows = []

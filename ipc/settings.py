@@ -35,7 +35,7 @@ class Settings:
             a step that still changes them then has not converged. 0: they are those at the start of the step, unchecked.
         friction_tolerance: a step renews them until they change by less than this fraction [-].
         linear_tolerance: relative residual ‖r‖/‖g‖ of the linear solve whose p is within ``velocity_tolerance`` and may be the last [-].
-        forcing: the same of the other linear solves with block-Jacobi [-]; 0: that of ``linear_tolerance``, which is the least.
+        forcing: the same of the other linear solves [-]; 0: that of ``linear_tolerance``, which is the least.
         max_linear: PCG iterations a solve.
         preconditioner: of PCG: ``"block_jacobi"``, ``"rest_inverse"`` (bonded bodies' rest matrix inverted once, contacts as a low-rank
             part; ``docs/concepts/preconditioners.md``), or ``"auto"``, whichever was measured to be faster on the device.

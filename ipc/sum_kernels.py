@@ -200,7 +200,10 @@ def sum_pairs(
     # outputs
     out: PairSums,
 ):  # fmt: skip
-    """A block of ``threads`` for each environment and pair; without friction ``lagged`` has no pairs."""
+    """A block of ``threads`` for each environment and pair.
+
+    Without friction ``lagged`` has no pairs.
+    """
     env, pair, lane = wp.tid()
     normal, place, weight = wp.vec3d(), wp.vec3d(), wp.vec3d()
     count = wp.min(contacts.count[env], contacts.force.shape[1])

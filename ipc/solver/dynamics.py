@@ -58,7 +58,10 @@ def inertia_target(
 def sum_followers(
     vert_gradient: VecArray2d, verts: VertexMap, nodes: IntArray, active: IntArray, threads: wp.int32, out: FloatArray2d
 ):
-    """Contact gradient of nodes that many vertices follow, three numbers each; blocks of threads (B, nodes, ``threads``)."""
+    """Contact gradient of nodes that many vertices follow, three numbers each.
+
+    A block of ``threads`` for each environment and node.
+    """
     env, k, lane = wp.tid()
     g = wp.vec3d()
     if active[env] != 0:

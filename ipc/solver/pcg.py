@@ -24,8 +24,8 @@ from ipc.solver.pcg_block import Scalars, solve_in_one_block
 
 wp.set_module_options({"enable_backward": False})
 
-ROUNDS = 4
-"""Iterations between two looks at whether any environment still runs."""
+ROUNDS = 2
+"""Iterations between two looks at whether any environment still runs; an even number."""
 ONE_BLOCK_NODES = 3000
 """Nodes up to which one block of threads solves a system."""
 ONE_BLOCK_TOTAL = 600_000

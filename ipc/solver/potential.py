@@ -24,7 +24,7 @@ from ipc.solver.linear import SystemView, find_volume_motions, push_blocks, push
 _SLICE = 32
 """Rows of the matrix that lie interleaved on CUDA: as many as threads run in step."""
 _CROWD = 64
-"""Vertices from which on a block of threads sums the contact forces of a node that they follow."""
+"""Vertices of a node from which on a block of threads sums their contact forces."""
 
 
 class Potential:

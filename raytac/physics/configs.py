@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, ClassVar, Unpack
 
 from raytac.checks import check_kind, check_known, check_methods
 from raytac.device import resolve_device
-from raytac.physics.soft.settings import DEFAULT_CONTROL, DEFAULT_CORRECTION, Correction, PressControl
+from raytac.physics.soft.settings import (
+    DEFAULT_ACCURACY,
+    DEFAULT_CONTROL,
+    DEFAULT_CORRECTION,
+    Correction,
+    PressControl,
+    SceneSettings,
+)
 from raytac.specs.press import PADS, PressScene
 from raytac.specs.sensor import SensorSpec
 
@@ -56,7 +63,9 @@ class Ipc:
     correction: Correction | None = DEFAULT_CORRECTION
     """Correction of the surface below the cells' size; None: the plain finite-element surface."""
     control: PressControl = DEFAULT_CONTROL
-    """Tolerances and search of a press; worlds have their own."""
+    """Tolerances and search of a press."""
+    accuracy: SceneSettings = DEFAULT_ACCURACY
+    """Tolerances of a world; looser ones are faster (docs/measurements/soft-pad.md)."""
     is_simulated: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -67,6 +76,7 @@ class Ipc:
         if self.correction is not None:
             check_kind("correction", self.correction, Correction)
         check_kind("control", self.control, PressControl)
+        check_kind("accuracy", self.accuracy, SceneSettings)
 
     @property
     def label(self) -> str:

@@ -85,6 +85,7 @@ class SoftPads:
             ignored=[(b.name, b.held_by) for b in scene.bodies if b.held_by is not None],
             num_envs=count,
             device=resolve_device(device, ray_tracing=False),
+            accuracy=physics.accuracy,
         )
         self._inputs = None
         if coupling == "two_way":

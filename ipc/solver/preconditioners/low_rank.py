@@ -454,16 +454,18 @@ def factor_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
 
 
 @wp.func
-def sum_of_parts(y: SingleArray3d, env: wp.int32, u: wp.int32) -> wp.float32:
+def sum_of_parts(y: SingleArray3d, place: wp.int32, u: wp.int32) -> wp.float32:
     total = wp.float32(0.0)
     for c in range(y.shape[0]):
-        total += y[c, env, u]
+        total += y[c, place, u]
     return total
 
 
 @wp.kernel
-def contact_forces(rest: Rest, y: SingleArray3d, z: VecArray2d, running: IntArray, lanes: wp.int32, small: Small):
-    """W t; y holds K_0⁻¹ r of pads, z L⁻¹ r of affine nodes.
+def contact_forces(
+    rest: Rest, y: SingleArray3d, z: VecArray2d, running: IntArray, place: IntArray, lanes: wp.int32, small: Small
+):
+    """W t; y holds K_0⁻¹ r of pads at an environment's ``place``, z L⁻¹ r of affine nodes.
 
     One block of threads an environment.
     """
@@ -476,7 +478,7 @@ def contact_forces(rest: Rest, y: SingleArray3d, z: VecArray2d, running: IntArra
         if rest.affine[node] >= 0:
             small.t[env, i] = z[env, node][i % 3]
         else:
-            small.t[env, i] = wp.float64(sum_of_parts(y, env, rest.unknown[node] + i % 3))
+            small.t[env, i] = wp.float64(sum_of_parts(y, place[env], rest.unknown[node] + i % 3))
     wait_for_block()
     for i in range(lane, n, lanes):
         total = wp.float64(0.0)
@@ -557,7 +559,7 @@ class LowRank:
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=block_dim)
 
     def find_contacts(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
-        """Number the contact nodes of the active environments; ``full`` (B,) is 1 where there is no room for them."""
+        """Number the contact nodes; ``full`` (B,) is 1 where an active environment has no room."""
         rest, small = self.rest, self.small
         self._launch(forget_contacts, small.touched.shape, [active, small])
         if rows:
@@ -567,7 +569,7 @@ class LowRank:
         self._launch(mark_full, self.batch, [active, small, self.full])
 
     def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
-        """Take in the affine bodies and the rows of the active environments, whose contact nodes are numbered."""
+        """Take in affine bodies and rows, after ``find_contacts``."""
         rest, small = self.rest, self.small
         if self.bodies:
             self._launch(factor_affine, (self.batch, self.bodies), [rest, system, active, small])
@@ -576,9 +578,10 @@ class LowRank:
             self._launch(add_rows, (self.batch, self.row_lanes), inputs)
             self._launch(factor_small, (self.batch, self.lanes), [rest, active, self.lanes, small], self.lanes)
 
-    def find_forces(self, y: wp.array, z: wp.array, running: wp.array) -> None:
+    def find_forces(self, y: wp.array, z: wp.array, running: wp.array, place: wp.array) -> None:
         """Compute ``small.force`` = W t for the running environments.
 
-        y (parts, B, n) holds K_0⁻¹ r of pads, z (B, N) L⁻¹ r of affine nodes.
+        y (parts, B, n) holds K_0⁻¹ r of pads at an environment's ``place`` (B,), z (B, N) L⁻¹ r of affine nodes.
         """
-        self._launch(contact_forces, (self.batch, self.lanes), [self.rest, y, z, running, self.lanes, self.small], self.lanes)
+        inputs = [self.rest, y, z, running, place, self.lanes, self.small]
+        self._launch(contact_forces, (self.batch, self.lanes), inputs, self.lanes)

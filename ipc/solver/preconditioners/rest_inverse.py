@@ -80,15 +80,26 @@ def multiply_vectors(
 
 
 @wp.kernel
+def place_running(running: IntArray, place: IntArray, total_running: IntArray):
+    """Numbers the running environments, so that products have no gaps; −1 for others."""
+    env = wp.tid()
+    before = wp.int32(0)
+    for other in range(env):
+        before += running[other]
+    place[env] = -1
+    if running[env] != 0:
+        place[env] = before
+    if env == running.shape[0] - 1:
+        total_running[0] = before + running[env]
+
+
+@wp.kernel
 def multiply_tiles(
-    matrix: SingleArray3d, x: SingleArray2d, x_first: wp.int32, y_first: wp.int32, running: IntArray, y: SingleArray2d
+    matrix: SingleArray3d, x: SingleArray2d, x_first: wp.int32, y_first: wp.int32, total_running: IntArray, y: SingleArray2d
 ):
-    """y = x · matrix in tiles, patch by patch, without those that have nothing running."""
+    """y = x · matrix in tiles, patch by patch, of the environments that run, which come first."""
     patch, i, j = wp.tid()
-    some = wp.int32(0)
-    for env in range(i * TILE_ENVS, wp.min((i + 1) * TILE_ENVS, running.shape[0])):
-        some += running[env]
-    if some == 0:
+    if i * TILE_ENVS >= total_running[0]:
         return
     inputs, outputs = matrix.shape[1], matrix.shape[2]
     block = matrix[patch]
@@ -106,10 +117,13 @@ class Product:
     Args:
         matrix: shape (patches, inputs, outputs), both a multiple of the tile.
         x: (B or more, …) and y: (parts, B or more, …), where patch p has inputs from x_first + p·inputs and outputs likewise.
+        total_running: how many environments run (1,); with tiles they have the first rows of x and y.
     """
 
-    def __init__(self, matrix: wp.array, x: wp.array, y: wp.array, x_first: int, y_first: int, batch: int) -> None:
-        self.matrix, self.x, self.y, self.batch = matrix, x, y, batch
+    def __init__(
+        self, matrix: wp.array, x: wp.array, y: wp.array, x_first: int, y_first: int, batch: int, total_running: wp.array
+    ) -> None:
+        self.matrix, self.x, self.y, self.batch, self.total_running = matrix, x, y, batch, total_running
         self.x_first, self.y_first = x_first, y_first
         self.y_whole = y[0]
 
@@ -125,9 +139,8 @@ class Product:
                 np.matmul(x, self.matrix.numpy()[p], out=y)
         elif tiled(self.batch, device):
             dim = (patches, self.x.shape[0] // TILE_ENVS, outputs // TILE_OUT)
-            wp.launch_tiled(
-                multiply_tiles, dim=dim, inputs=[*common, running], outputs=[self.y_whole], block_dim=LANES, device=device
-            )
+            inputs = [*common, self.total_running]
+            wp.launch_tiled(multiply_tiles, dim=dim, inputs=inputs, outputs=[self.y_whole], block_dim=LANES, device=device)
         else:
             parts = self.y.shape[0]
             inputs_of = [*common, -(-inputs // parts), running]
@@ -158,13 +171,13 @@ class Inside:
 
 
 @wp.kernel
-def gather_inside(inside: Inside, r: VecArray2d, running: IntArray, x: SingleArray2d):
+def gather_inside(inside: Inside, r: VecArray2d, running: IntArray, place: IntArray, x: SingleArray2d):
     """r_p of every patch, in single precision."""
     env, i = wp.tid()
     u = inside.unknown[i]
     if running[env] != 0 and u >= 0:
         for c in range(3):
-            x[env, u + c] = wp.float32(r[env, i][c])
+            x[place[env], u + c] = wp.float32(r[env, i][c])
 
 
 @wp.kernel
@@ -176,6 +189,7 @@ def gather_interface(
     small: Small,
     jacobi: MatArray2d,
     running: IntArray,
+    place: IntArray,
     # outputs
     x: SingleArray2d,
     z: VecArray2d,
@@ -199,8 +213,8 @@ def gather_interface(
     for c in range(3):
         value = wp.float32(r[env, i][c])
         for k in range(inside.twin_start[i], inside.twin_start[i + 1]):
-            value -= sum_of_parts(y_inside, env, inside.twin_out[k] + c)
-        x[env, u + c] = value
+            value -= sum_of_parts(y_inside, place[env], inside.twin_out[k] + c)
+        x[place[env], u + c] = value
 
 
 @wp.kernel
@@ -211,6 +225,7 @@ def scatter_interface(
     r: VecArray2d,
     y: SingleArray3d,
     running: IntArray,
+    place: IntArray,
     # outputs
     z: VecArray2d,
     x_back: SingleArray2d,
@@ -228,8 +243,8 @@ def scatter_interface(
     u = rest.unknown[i]
     if u < 0:
         return
-    part = rest.part[i]
-    value = wp.vec3(sum_of_parts(y, env, u), sum_of_parts(y, env, u + 1), sum_of_parts(y, env, u + 2))
+    part, at = rest.part[i], place[env]
+    value = wp.vec3(sum_of_parts(y, at, u), sum_of_parts(y, at, u + 1), sum_of_parts(y, at, u + 2))
     for k in range(small.count[env]):
         node = small.node[env, k]
         if rest.part[node] == part:
@@ -241,12 +256,19 @@ def scatter_interface(
     z[env, i] = wp.vec3d(wp.float64(value[0]), wp.float64(value[1]), wp.float64(value[2]))
     for k in range(inside.twin_start[i], inside.twin_start[i + 1]):
         for d in range(3):
-            x_back[env, inside.twin_in[k] + d] = value[d]
+            x_back[at, inside.twin_in[k] + d] = value[d]
 
 
 @wp.kernel
 def scatter_inside(
-    inside: Inside, y_inside: SingleArray3d, y_back: SingleArray3d, small: Small, running: IntArray, z: VecArray2d
+    inside: Inside,
+    y_inside: SingleArray3d,
+    y_back: SingleArray3d,
+    small: Small,
+    running: IntArray,
+    place: IntArray,
+    # outputs
+    z: VecArray2d,
 ):
     """x_p = K_pp⁻¹ r_p − E_p x_Γ."""
     env, i = wp.tid()
@@ -256,7 +278,7 @@ def scatter_inside(
     at = inside.patch_out[i]
     value = wp.vec3d()
     for c in range(3):
-        value[c] = wp.float64(sum_of_parts(y_inside, env, at + c) - sum_of_parts(y_back, env, u + c))
+        value[c] = wp.float64(sum_of_parts(y_inside, place[env], at + c) - sum_of_parts(y_back, place[env], u + c))
     z[env, i] = value
 
 
@@ -294,6 +316,8 @@ class RestInverse:
         patches: int | None = None,
     ) -> None:
         self.batch, self.device, self.on_host = batch, device, not device.is_cuda
+        self._place = wp.array(np.arange(batch), dtype=wp.int32, device=device)
+        self._total = wp.zeros(1, dtype=wp.int32, device=device)
         count = len(layout.node_rest)
         blocks = rest_blocks(layout, settings)
         bodies = [condense(layout, blocks, *choose_partition(layout, body, patches)) for body in bonded_bodies(layout)]
@@ -321,7 +345,8 @@ class RestInverse:
         self.x, self.y = self._vectors(int(firsts[-1]), int(firsts[-1]))
         views = [rest.inverse[int(s) : int(s) + w * w].reshape((1, w, w)) for s, w in zip(starts, widths, strict=False)]
         self.products = [
-            Product(view, self.x, self.y, int(first), int(first), batch) for view, first in zip(views, firsts, strict=False)
+            Product(view, self.x, self.y, int(first), int(first), batch, self._total)
+            for view, first in zip(views, firsts, strict=False)
         ]
         self._lay_out_patches([patch for body in bodies for patch in body.patches], count)
         self.jacobi = BlockJacobi(layout, batch, lanes, device)
@@ -367,25 +392,27 @@ class RestInverse:
         self.x_back, self.y_back = self._vectors(len(patches) * border, len(patches) * inner)
         if patches:
             matrices = [wp.array(m, dtype=wp.float32, device=self.device) for m in (forward, backward)]
-            self.to_interface = Product(matrices[0], self.x_inside, self.y_inside, 0, 0, self.batch)
-            self.from_interface = Product(matrices[1], self.x_back, self.y_back, 0, 0, self.batch)
+            self.to_interface = Product(matrices[0], self.x_inside, self.y_inside, 0, 0, self.batch, self._total)
+            self.from_interface = Product(matrices[1], self.x_back, self.y_back, 0, 0, self.batch, self._total)
 
     def _launch(self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
-        """Take in the contacts of the active environments, and the diagonal of their matrix where it is used."""
+        """Take in the contacts of the active environments, and the diagonal where it is used."""
         self.low_rank.find_contacts(system, contacts, rows, active)
         self.jacobi.update(system, contacts, rows, active if self._free else self.low_rank.full)
         self.low_rank.update(system, contacts, rows, active)
 
     def apply(self, r: wp.array, running: wp.array, z: wp.array) -> None:
         """z = M⁻¹ r for the running environments; arrays (B, N) of vec3d."""
-        rest, inside, small = self.rest, self.inside, self.low_rank.small
+        rest, inside, small, place = self.rest, self.inside, self.low_rank.small, self._place
+        if tiled(self.batch, self.device):
+            self._launch(place_running, (self.batch,), [running], [place, self._total])
         if self.patched:
-            self._launch(gather_inside, r.shape, [inside, r, running], [self.x_inside])
+            self._launch(gather_inside, r.shape, [inside, r, running, place], [self.x_inside])
             self.to_interface.compute(running)
-        inputs = [rest, inside, r, self.y_inside, small, self.jacobi.inverse, running]
+        inputs = [rest, inside, r, self.y_inside, small, self.jacobi.inverse, running, place]
         self._launch(gather_interface, r.shape, inputs, [self.x, z])
         if self.jacobi.affine:
             threads = self.jacobi.affine.threads
@@ -393,8 +420,8 @@ class RestInverse:
             wp.launch(eliminate_where_full, (self.batch, threads), inputs, [z], device=self.device, block_dim=BLOCK_THREADS)
         for product in self.products:
             product.compute(running)
-        self.low_rank.find_forces(self.y, z, running)
-        self._launch(scatter_interface, r.shape, [rest, inside, small, r, self.y, running], [z, self.x_back])
+        self.low_rank.find_forces(self.y, z, running, place)
+        self._launch(scatter_interface, r.shape, [rest, inside, small, r, self.y, running, place], [z, self.x_back])
         if self.patched:
             self.from_interface.compute(running)
-            self._launch(scatter_inside, r.shape, [inside, self.y_inside, self.y_back, small, running], [z])
+            self._launch(scatter_inside, r.shape, [inside, self.y_inside, self.y_back, small, running, place], [z])

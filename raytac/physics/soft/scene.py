@@ -19,12 +19,11 @@ from raytac.physics.soft.coat_state import CoatState, SceneCoat
 from raytac.physics.soft.mesh import pad_stiffness
 from raytac.physics.soft.reading import PadArrays, SoftReader, SoftReading
 from raytac.physics.soft.scene_state import Poses, SceneReport, SceneState
-from raytac.physics.soft.settings import SceneSettings
+from raytac.physics.soft.settings import DEFAULT_ACCURACY, SceneSettings
 from raytac.physics.soft.substeps import Sleep, Substeps
 from raytac.se3 import batch_of, inverse, nearest_rotation, quaternion, quaternions, rigid_poses
 
 _GRAVITY = 0.0, 0.0, -9.81
-_ACCURACY = SceneSettings()
 _Poses = Mapping[str, ArrayLike]
 """``world_from_body`` by name, (4, 4) or (B, 4, 4)."""
 
@@ -58,7 +57,7 @@ class SoftScene:
         num_envs: int | None = None,
         device: str = "cpu",
         settings: ipc.Settings | None = None,
-        accuracy: SceneSettings = _ACCURACY,
+        accuracy: SceneSettings = DEFAULT_ACCURACY,
     ) -> None:
         """Put pads and bodies into the solver at their initial poses, clear of each other.
 

@@ -121,7 +121,7 @@ class SceneSettings(_Settings):
     linear_tolerance: float = 1e-6
     """Relative residual of the linear solve: a grasped body must follow far below ``slip``."""
     forcing: float = 1e-2
-    """The same of the other linear solves, as long as the step is large (block-Jacobi only)."""
+    """The same of the other linear solves, as long as the step is large."""
     substeps: SubstepLimits = SubstepLimits()
     """Division of steps near contact."""
 
@@ -172,3 +172,4 @@ class PressControl(_Settings):
 
 
 DEFAULT_CONTROL = PressControl()
+DEFAULT_ACCURACY = SceneSettings()
