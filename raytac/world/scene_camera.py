@@ -12,8 +12,8 @@ from raytac.world.world import TactileWorld
 
 _SHARP = 3
 """Samples of a pixel along each side."""
-_SKY = np.array([(226.0, 232.0, 240.0), (250.0, 250.0, 250.0)])
-"""Colour of the background at the top and at the bottom of a picture."""
+_SKY = np.array((238.0, 241.0, 245.0), np.float32)
+"""Colour of the background: one, since a GIF has few."""
 _FLOOR, _LINES = (0.83, 0.84, 0.85, 1.0), (0.70, 0.71, 0.73, 1.0)
 _TILE, _REACH, _LINE = 0.1, 1.2, 0.8e-3
 """Spacing of a floor's lines, their reach from the centre, and half their width [m]."""
@@ -96,8 +96,7 @@ class SceneCamera:
         width, height = self.resolution
         picture = self._renderer.render().astype(np.float32)
         nothing = (picture == 0.0).all(axis=2, keepdims=True)  # where no geom is: MuJoCo leaves it black
-        sky = _SKY[0] + np.linspace(0.0, 1.0, len(picture))[:, None, None] * (_SKY[1] - _SKY[0])
-        picture = np.where(nothing, sky, picture)
+        picture = np.where(nothing, _SKY, picture)
         return np.rint(picture.reshape(height, _SHARP, width, _SHARP, 3).mean(axis=(1, 3))).astype(np.uint8)
 
     def _add(self, kind: mujoco.mjtGeom, size: np.ndarray, at: np.ndarray, turn: np.ndarray, colour: np.ndarray) -> None:
