@@ -5,19 +5,26 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from raytac.frame import TactileFrame
 from raytac.gel.surface import make_grid
+from raytac.optics import Taxim
+from raytac.optics.taxim.bake.bake import calibrate
+from raytac.optics.taxim.bake.presses import pressed as pressed_surface
+from raytac.optics.taxim.bake.settings import BakeSettings
+from raytac.optics.taxim.bake.views import Calibration
 from raytac.physics.rigid.contacts import LoadTables
 from raytac.physics.rigid.search import PadSearch
 from raytac.sensor import TactileSensor
 from raytac.shapes.part import primitive
-from raytac.specs import MarkerSpec, SensorSpec, load_press, load_sensor
+from raytac.specs import MarkerSpec, SensorSpec, lights_text, load_press, load_sensor, load_task, sensor_files
 from raytac.specs.height_map import HeightMap
 from raytac.specs.press import StageSpec
+from raytac.world import TactileWorld
 
 SIZE = (160, 120)
 BALL = replace(load_press("sphere"), trajectory=(StageSpec("indent", depth=0.5e-3),))
@@ -77,3 +84,36 @@ def test_the_contact_search_of_worlds_measures_a_map_as_the_dome(kind: str) -> N
     assert np.abs(mapped.centre - dome.centre).max() < 50e-6
     loads = [LoadTables(found, np.full(6, spec.gelpad.thickness)).force(np.full(6, 0.3e-3))[0] for found in (dome, mapped)]
     assert loads[1] == pytest.approx(loads[0], rel=0.02) and loads[0].min() > 0.05
+
+
+def test_a_table_baked_on_a_map_of_a_dome_is_the_domes() -> None:
+    images = []
+    for spec in (load_sensor("gelsight_dome"), as_map(load_sensor("gelsight_dome"))):
+        at = Calibration(spec, device="cpu", resolution=(64, 48))
+        settings = BakeSettings(images=16, n_bins=45, pins=0, radius=(3e-3, 5e-3), depth=(0.2e-3, 0.6e-3), bare_share=1.0)
+        mode = Taxim(calibration=calibrate(at, settings=settings).table).build(spec, resolution=(64, 48), device="cpu")
+        ball = np.eye(4)
+        ball[2, 3] = 4e-3 - 0.5e-3
+        images.append(mode.render(pressed_surface(at.grid, [primitive("sphere", (4e-3,), ball)], None)).rgb[0].astype(int))
+    assert np.abs(images[1] - images[0]).mean() < 0.1 and np.abs(images[1] - images[0]).max() <= 8
+    assert images[0].std() > 5.0
+
+
+def test_a_world_takes_a_written_sensor_with_a_map_of_its_gel(tmp_path: Path) -> None:
+    """Two pads as fingers, whose gels may touch each other, closed until they do."""
+    mini, readings = as_map(load_sensor("gelsight_mini")), []
+    for name, text in (sensor_files(mini) | {"lights.toml": lights_text(mini.lights, "of a test")}).items():
+        (tmp_path / name).write_text(text, "utf-8")
+    for sensor in ("gelsight_mini", str(tmp_path / "sensor.toml")):
+        scene = load_task("lift_cube")
+        world = TactileWorld(
+            replace(scene, robot=replace(scene.robot, sensor=sensor)), outputs=("wrench", "height"), device="cpu"
+        )
+        for _ in range(40):
+            state = world.step(lambda data, time, servo=world.composed.opening: data.ctrl.__setitem__(servo, 0.0))
+        readings.append((np.concatenate([state.wrench[side][0] for side in ("left", "right")]), world.observe()["left"].height))
+        assert not state.failed.any()
+    (dome, dome_height), (mapped, mapped_height) = readings
+    assert np.abs(dome[:3]).max() > 0.5, "the fingers have not met"
+    assert mapped == pytest.approx(dome, rel=0.02, abs=0.02)
+    assert np.abs(mapped_height - dome_height).max() < 10e-6

@@ -90,8 +90,7 @@ def _check_surface(sensor: SensorSpec, surface: HeightMap) -> None:
         extent = in_mm(tuple(2.0 * half for half in surface.half))
         rule = f"the map covers {extent} mm: must cover the pad of {in_mm(pad.size)} mm"
         raise _error(sensor, "gelpad.surface_pitch_mm", in_mm(surface.spacing), rule)
-    x, y = (np.linspace(-side / 2, side / 2, count) for side, count in zip(pad.size, _samples(pad.size, surface), strict=True))
-    z = surface.height(x[None, :], y[:, None])
+    x, y, z = _at_rest(pad.size, surface)
     middle = float(surface.height(0.0, 0.0))
     if abs(middle) > _SLACK:
         rule = f"must be 0 in the middle of the pad, not {middle * 1e3:.4g} mm: HeightMap.centred makes it so"
@@ -106,10 +105,12 @@ def _check_surface(sensor: SensorSpec, surface: HeightMap) -> None:
             raise _error(sensor, "gelpad.surface", surface, f"{place}, with 0 in the middle: {rule}")
 
 
-def _samples(size: tuple[float, float], surface: HeightMap) -> tuple[int, int]:
-    """Places to look at along x and y: as far apart as the nodes of a map, at most."""
-    nx, ny = (math.ceil(side / step) + 1 for side, step in zip(size, surface.spacing, strict=True))
-    return nx, ny
+def _at_rest(size: tuple[float, float], surface: HeightMap) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """x, y and heights (Ny, Nx) of a map over a pad, at most as far apart as its nodes."""
+    x, y = (
+        np.linspace(-side / 2, side / 2, math.ceil(side / step) + 1) for side, step in zip(size, surface.spacing, strict=True)
+    )
+    return x, y, surface.height(x[None, :], y[:, None])
 
 
 def _check_camera_behind(sensor: SensorSpec) -> None:
@@ -175,15 +176,21 @@ def _check_lens(sensor: SensorSpec) -> None:
 
 
 def _check_view(sensor: SensorSpec) -> None:
-    """The outermost pixels see the pad: x = position_x + (u − cx) · pitch at z = 0, y alike."""
+    """The outermost pixels see the pad: x = position_x + (u − cx) · pitch at z = 0, y alike.
+
+    A map may rise above z = 0, where the view is wider.
+    """
     pad, camera = sensor.gelpad, sensor.camera
-    for axis, (name, (low, high)) in enumerate(zip("xy", view_edges(sensor), strict=True)):
+    top = 0.0 if pad.surface is None else max(0.0, float(_at_rest(pad.size, pad.surface)[2].max()))
+    wider = 1.0 - top / camera.position[2]
+    for axis, (name, edges) in enumerate(zip("xy", view_edges(sensor), strict=True)):
+        low, high = (camera.position[axis] + wider * (edge - camera.position[axis]) for edge in edges)
         at, principal = camera.position[axis], camera.principal_point[axis]
         pixels, pitch = camera.resolution[axis], camera.pixel_pitch[axis]
         half = pad.size[axis] / 2
         if low < -half - _SLACK or high > half + _SLACK:
             rule = (
-                f"the view runs off the pad: at z = 0 it covers {name} = {low * 1e3:.4g} to {high * 1e3:.4g} mm, "
+                f"the view runs off the pad: at z = {top * 1e3:.3g} it covers {name} = {low * 1e3:.4g} to {high * 1e3:.4g} mm, "
                 f"must stay within {-half * 1e3:.4g} to {half * 1e3:.4g} mm"
             )
             if camera.lens.tilts:

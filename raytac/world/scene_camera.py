@@ -10,7 +10,17 @@ import numpy as np
 from raytac.errors import BackendError, InputError
 from raytac.world.world import TactileWorld
 
-_BACKGROUND = 235
+_SHARP = 3
+"""Samples of a pixel along each side."""
+_SKY = np.array((238.0, 241.0, 245.0), np.float32)
+"""Colour of the background: one, since a GIF has few."""
+_FLOOR, _LINES = (0.83, 0.84, 0.85, 1.0), (0.70, 0.71, 0.73, 1.0)
+_TILE, _REACH, _LINE = 0.1, 1.2, 0.8e-3
+"""Spacing of a floor's lines, their reach from the centre, and half their width [m]."""
+_AWAY = np.array([-0.35, 0.45, 1.0])
+"""Direction to the lamp: to the right of the eye, towards it, and up."""
+_LAMP = 1.6
+"""Distance of the lamp from the centre of the picture [m]."""
 _BALL = 4e-3
 """Radius of the balls that mark points [m]."""
 _GREEN = np.array([0.1, 0.7, 0.2, 0.8], np.float32)
@@ -19,6 +29,7 @@ _GREEN = np.array([0.1, 0.7, 0.2, 0.8], np.float32)
 class SceneCamera:
     """Camera at a fixed pose in every environment of a world.
 
+    A floor gets a grid of 0.1 m, and a scene without lamps of its own a lamp that casts shadows; nothing of it is in the model.
     Needs OpenGL without a display: MuJoCo reads the environment variable ``MUJOCO_GL`` (``egl`` or ``osmesa``) when it is imported.
     Soft pads are not drawn, since MuJoCo does not have their gel.
     """
@@ -36,7 +47,7 @@ class SceneCamera:
         """Open the renderer.
 
         Args:
-            world: world to draw. The headlight of its model is made brighter, which only pictures show.
+            world: world to draw. The headlight of its model is changed, which only pictures show.
             resolution: (width, height) [px], at most 640 x 480.
             distance: from the camera to ``lookat`` [m].
             azimuth, elevation: direction of the view [°].
@@ -51,13 +62,18 @@ class SceneCamera:
         if not (1 <= width <= largest[0] and 1 <= height <= largest[1]):
             raise InputError("resolution", value=resolution, rule=f"must be from 1x1 to {largest[0]}x{largest[1]} pixels")
         self.world, self.resolution = world, (width, height)
+        self._has_lamp = world.model.nlight > 0
         light = world.model.vis.headlight
-        light.ambient[:], light.diffuse[:] = 0.35, 0.6
+        light.ambient[:], light.diffuse[:], light.specular[:] = (0.35, 0.6, 0.1) if self._has_lamp else (0.45, 0.25, 0.0)
+        buffer = world.model.vis.global_
+        buffer.offwidth, buffer.offheight = _SHARP * width, _SHARP * height
         try:
-            self._renderer = mujoco.Renderer(world.model, height, width)
+            self._renderer = mujoco.Renderer(world.model, _SHARP * height, _SHARP * width)
         except Exception as error:
             rule = "set MUJOCO_GL=egl (or osmesa) before Python starts, and install libEGL (or libOSMesa)"
             raise BackendError(f"MuJoCo cannot draw here ({error}): {rule}") from error
+        finally:
+            buffer.offwidth, buffer.offheight = largest
         if lookat is None:
             lookat = np.mean([poses[0, :3, 3] for poses in world.state().world_from_pad.values()], axis=0)
         self._camera = mujoco.MjvCamera()
@@ -72,15 +88,52 @@ class SceneCamera:
         if not 0 <= env < self.world.num_envs:
             raise InputError("env", value=env, rule=f"must be from 0 to {self.world.num_envs - 1}")
         self._renderer.update_scene(self.world.data[env], self._camera)
-        scene = self._renderer.scene
         for point in points:
-            geom = scene.geoms[scene.ngeom]
-            size, turn = np.full(3, _BALL), np.eye(3).ravel()
-            mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_SPHERE, size, np.asarray(point, float), turn, _GREEN)
+            self._add(mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, _BALL), np.asarray(point, float), np.eye(3), _GREEN)
+        self._lay_floor()
+        if not self._has_lamp:
+            self._hang_lamp()
+        width, height = self.resolution
+        picture = self._renderer.render().astype(np.float32)
+        nothing = (picture == 0.0).all(axis=2, keepdims=True)  # where no geom is: MuJoCo leaves it black
+        picture = np.where(nothing, _SKY, picture)
+        return np.rint(picture.reshape(height, _SHARP, width, _SHARP, 3).mean(axis=(1, 3))).astype(np.uint8)
+
+    def _add(self, kind: mujoco.mjtGeom, size: np.ndarray, at: np.ndarray, turn: np.ndarray, colour: np.ndarray) -> None:
+        scene = self._renderer.scene
+        if scene.ngeom < scene.maxgeom:
+            mujoco.mjv_initGeom(scene.geoms[scene.ngeom], kind, size, at, turn.ravel(), colour)
             scene.ngeom += 1
-        picture = self._renderer.render()
-        picture[(picture == 0).all(axis=2)] = _BACKGROUND  # where no geom is: MuJoCo leaves it black
-        return picture
+
+    def _lay_floor(self) -> None:
+        """Planes without a texture in a light grey, with a grid around the centre of the picture."""
+        scene, plane = self._renderer.scene, mujoco.mjtGeom.mjGEOM_PLANE
+        for geom in [scene.geoms[k] for k in range(scene.ngeom) if scene.geoms[k].type == plane and scene.geoms[k].matid < 0]:
+            geom.rgba[:], turn, at = _FLOOR, geom.mat.copy(), geom.pos.copy()
+            middle = np.round(turn.T @ (self._camera.lookat - at) / _TILE) * _TILE
+            edge = np.where(geom.size[:2] > 0.0, geom.size[:2], np.inf)
+            for axis in (0, 1):
+                span = np.clip(middle[1 - axis] + np.array([-_REACH, _REACH]), -edge[1 - axis], edge[1 - axis])
+                for line in np.arange(-_REACH, _REACH + 0.5 * _TILE, _TILE) + middle[axis]:
+                    if abs(line) > edge[axis] or span[1] <= span[0]:
+                        continue
+                    place, size = np.zeros(3), np.full(3, 0.1e-3)
+                    place[axis], place[1 - axis], size[axis], size[1 - axis] = line, span.mean(), _LINE, 0.5 * np.ptp(span)
+                    self._add(mujoco.mjtGeom.mjGEOM_BOX, size, at + turn @ place, turn, np.array(_LINES, np.float32))
+
+    def _hang_lamp(self) -> None:
+        """One lamp over the camera's shoulder, whose shadows fall to the side."""
+        scene, azimuth = self._renderer.scene, np.radians(self._camera.azimuth)
+        along = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        right, up = np.array([along[1], -along[0], 0.0]), np.array([0.0, 0.0, 1.0])
+        away = _AWAY[0] * right - _AWAY[1] * along + _AWAY[2] * up
+        away *= _LAMP / np.linalg.norm(away)
+        lamp = scene.lights[scene.nlight]
+        lamp.pos[:], lamp.dir[:] = self._camera.lookat + away, -away / _LAMP
+        lamp.type, lamp.headlight, lamp.castshadow = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL), 0, 1
+        lamp.attenuation[:] = 1.0, 0.0, 0.0
+        lamp.ambient[:], lamp.diffuse[:], lamp.specular[:] = 0.0, 0.5, 0.15
+        scene.nlight += 1
 
     def close(self) -> None:
         """Free the renderer."""

@@ -13,10 +13,12 @@ import pytest
 from PIL import Image
 
 from raytac.sensor import TactileSensor
-from raytac.specs import load_press
+from raytac.specs import load_press, load_task
 from raytac.view.press_session import PressSession
 from raytac.view.session import SessionMenu
 from raytac.view.viewer import Viewer
+from raytac.view.world_session import WorldSession
+from raytac.world import TactileWorld
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright, which drives the browser, is not installed")
 
@@ -244,6 +246,66 @@ def test_another_object_is_chosen_and_one_that_cannot_be_is_said(page, viewer):
     press(page, "Step")
     wait_until(lambda: viewer.player.status.count == 1, page)
     assert viewer.player.session.title.startswith("torus")
+
+
+def test_every_control_of_a_task_does_something(page, tmp_path):
+    """In the same browser, on a page of its own: a robot with two sensors, steered and played."""
+    world = TactileWorld(
+        load_task("lift_cube"), optics="phong", outputs=("rgb", "wrench", "normals"), resolution=(80, 60), device="cpu"
+    )
+    session = WorldSession(world, steps=4)
+    with Viewer(session, folder=tmp_path, port=0) as viewer:
+        task = page.context.new_page()
+        task.set_default_timeout(PATIENCE)
+        task.goto(viewer.url)
+        task.get_by_text("paused").wait_for()
+        by_joints = [control for control in session.controls if control.name.startswith("joint ")]
+        others = [control for control in session.controls if control not in by_joints]
+        assert len(by_joints) == 7 and {"x", "yaw", "opening"} <= {control.name for control in others}
+        for group in (others, by_joints):  # joints take over from the pose
+            now, aims = session.snapshot().controls, {}
+            for control in group:
+                sign = 1 if now[control.name] + 10 * control.step <= control.high else -1
+                aims[control.name] = now[control.name] + sign * 10 * control.step
+                number(task, control.label).fill(f"{aims[control.name]:.4f}")
+                number(task, control.label).press("Enter")
+            task.wait_for_timeout(500)
+            count = viewer.player.status.count
+            press(task, "Step")
+            wait_until(lambda count=count: viewer.player.status.count > count and viewer.player.status.mode == "paused", task)
+            asked = session.snapshot().controls
+            assert {c.label for c in group if abs(asked[c.name] - aims[c.name]) > 2 * c.step} == set()
+        keep(task, "task")
+        start = task.locator("img").first.get_attribute("src")
+        began = session.snapshot().time or 0.0
+        press(task, "Play")
+        wait_until(lambda: viewer.player.status.count > 4, task)
+        press(task, "Pause")
+        task.get_by_text("paused").wait_for()
+        assert (session.snapshot().time or 0.0) > began > 0.0
+        for kind in ("height", "normals", "tactile image"):
+            before = task.locator("img").first.get_attribute("src")
+            choose(task, "picture", kind)
+            wait_until(lambda before=before: task.locator("img").first.get_attribute("src") != before, task)
+        assert start is not None
+        for label in ("plots", "see through", "handle"):
+            tick(task, label)
+            tick(task, label)
+        for look in (*world.sensors, "all"):
+            press(task, look)
+        number(task, "timeline").fill("1")
+        number(task, "timeline").press("Enter")
+        task.get_by_text(f"state 2 of {len(viewer._page._history)}").wait_for()
+        keep(task, "task_past")
+        tick(task, "save 3-D view")
+        for kind in ("PNG", "Recording"):
+            with task.expect_download(timeout=PATIENCE) as told:
+                press(task, kind)
+            assert (tmp_path / told.value.suggested_filename).stat().st_size > 1000
+        press(task, "Reset")
+        wait_until(lambda: viewer.player.status.count == 0, task)
+        assert session.snapshot().time == 0.0
+        task.close()
 
 
 def controls(viewer: Viewer) -> dict[str, float]:
