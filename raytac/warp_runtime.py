@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from threading import RLock
 from typing import Any
 
@@ -28,10 +29,11 @@ On the CPU Warp has one recording and one place for tiles a process, where threa
 """
 
 
+@cache
 def start_warp() -> None:
     """Start Warp as ``ipc`` does: quietly, and with a cache of kernels that can be written.
 
-    Where another package hides ``ipc``, Warp starts as it does by itself.
+    Where another package hides ``ipc``, Warp starts as it does by itself. Once a process: that is asked of files.
     """
     if foreign_ipc() is None:
         from ipc import start_warp as start

@@ -44,21 +44,22 @@ def print_dots(
 
 
 class DeviceInk:
-    """Coverage of the surfaces of B pads by round dots, which ``dot_ink`` describes."""
+    """Coverage of the surfaces of B pads by round dots, which ``dot_ink`` describes.
+
+    Attributes:
+        ink: shares (B, Ny, Nx), float32, of the last call.
+    """
 
     def __init__(self, grid: PadGrid, radius: float, *, num_envs: int, device: str = "cpu") -> None:
         """``grid``: nodes of the pads; ``radius`` of a dot [m]."""
         start_warp()
-        self._ink = wp.zeros((num_envs, *grid.shape), dtype=wp.float32, device=device)
+        self.ink = wp.zeros((num_envs, *grid.shape), dtype=wp.float32, device=device)
         dx, dy = grid.pitch
         reach = wp.vec2i(*(int(np.ceil(radius / pitch)) + 1 for pitch in (dx, dy)))
-        self._inputs = [wp.vec2d(float(grid.x[0]), float(grid.y[0])), wp.vec2d(dx, dy), reach, wp.float32(radius), self._ink]
+        self._inputs = [wp.vec2d(float(grid.x[0]), float(grid.y[0])), wp.vec2d(dx, dy), reach, wp.float32(radius), self.ink]
 
     def __call__(self, centres: wp.array) -> wp.array:
-        """Shares (B, Ny, Nx), float32, of dots at ``centres`` (B, M), vectors of float64 [m].
-
-        The next call overwrites them.
-        """
-        self._ink.zero_()
-        wp.launch(print_dots, dim=centres.shape, inputs=[centres, *self._inputs], device=self._ink.device)
-        return self._ink
+        """``ink`` of dots at ``centres`` (B, M), vectors of float64 [m]."""
+        self.ink.zero_()
+        wp.launch(print_dots, dim=centres.shape, inputs=[centres, *self._inputs], device=self.ink.device)
+        return self.ink

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -107,10 +109,34 @@ def dot_ink(grid: PadGrid, centres: np.ndarray, radius: float) -> np.ndarray:
     it is neglected. Its edge is one grid spacing wide, so that images interpolate it without steps. Centres that are not finite print no
     dot.
     """
-    import warp as wp
+    return DotInk(grid, radius)(centres)
 
-    from raytac.markers.ink_kernels import DeviceInk
 
-    at = np.ascontiguousarray(centres[..., :2], float)
-    dots = DeviceInk(grid, radius, num_envs=len(at))
-    return dots(wp.array(at, dtype=wp.vec2d, device="cpu", copy=False)).numpy()
+class DotInk:
+    """``dot_ink`` of one grid and radius for frame after frame; memory and launch stay."""
+
+    def __init__(self, grid: PadGrid, radius: float) -> None:
+        self.grid, self._radius = grid, radius
+        self._centres, self._ink = np.empty((0, 0, 2)), np.empty(0)
+        self._print: Any = None
+
+    def __call__(self, centres: np.ndarray) -> np.ndarray:
+        """As of ``dot_ink``."""
+        shape = *centres.shape[:2], 2
+        if shape != self._centres.shape:
+            self._make(shape)
+        self._centres[:] = centres[..., :2]
+        self._print()
+        return self._ink.copy()
+
+    def _make(self, shape: tuple[int, ...]) -> None:
+        """Memory and launch for centres of a shape, whose number of pads seldom changes."""
+        import warp as wp
+
+        from raytac.markers.ink_kernels import DeviceInk
+        from raytac.warp_runtime import Recorded
+
+        dots = DeviceInk(self.grid, self._radius, num_envs=shape[0])
+        centres = wp.zeros(shape[:2], dtype=wp.vec2d, device="cpu")
+        self._print = Recorded(partial(dots, centres))
+        self._centres, self._ink = centres.numpy(), dots.ink.numpy()

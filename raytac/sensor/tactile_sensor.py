@@ -20,7 +20,7 @@ from raytac.gel.pyramid import ElasticSurround
 from raytac.gel.surface import GelSurface, PadGrid, check_grid, chosen_envs, grid_pitch, make_grid, on_grid
 from raytac.gel.traction import cell_areas
 from raytac.markers.base import MarkersConfig
-from raytac.markers.pattern import MarkerPattern, dot_ink
+from raytac.markers.pattern import DotInk, MarkerPattern
 from raytac.markers.registry import MARKERS
 from raytac.markers.tracker import MarkerFrame, MarkerTracker
 from raytac.optics.base import OPTICAL_OUTPUTS, BuiltOptics, OpticalMode, OpticsConfig, OpticsImages, start
@@ -134,6 +134,7 @@ class TactileSensor:
         if self.markers is not None:
             MarkerPattern.of(self.spec, self.resolution)  # refuse a pattern outside the view now
         self._tracker: MarkerTracker | None = None
+        self._ink: DotInk | None = None
         wanted = check_truth("noise", noise)
         self._grain = Grain(self.spec, self.resolution, seed=self.seed, batch=self.num_envs) if wanted else None
         self.optics.check(self.spec)
@@ -484,7 +485,9 @@ class TactileSensor:
         """The surface with dots printed where the markers are, if there is an image to show them."""
         if not {"rgb", "layers"} & set(self._optical_outputs):
             return surface
-        return replace(surface, ink=dot_ink(surface.grid, markers.position, self.spec.markers.radius))
+        if self._ink is None or self._ink.grid is not surface.grid:
+            self._ink = DotInk(surface.grid, self.spec.markers.radius)
+        return replace(surface, ink=self._ink(markers.position))
 
     def object_height(self, surface: GelSurface) -> np.ndarray | None:
         """Underside of the loaded object [m], (B, Ny, Nx), inf beside it; None without an object."""

@@ -95,9 +95,9 @@ class RigidPads(RigidReadings):
         self._views.before[:] = np.nan
         # No environment waits for those that take shorter steps.
         total, done = ticks * round(scene.control_timestep / scene.timestep), np.zeros(len(failed), int)
-        while len(envs := np.flatnonzero(~failed & (done < total))):
+        while len(envs := (~failed & (done < total)).nonzero()[0]):
             done[envs] += self._step(envs, drive, done[envs] % ticks, failed)
-        if len(sound := np.flatnonzero(~failed)):
+        if len(sound := (~failed).nonzero()[0]):
             self.contact.choose(sound, 0)
             self.engine.update_poses()  # so that they are those of the end of the step
             self._move()

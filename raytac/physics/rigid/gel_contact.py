@@ -188,7 +188,9 @@ class GelContact:
     def _move_bodies(self) -> None:
         inputs = [self.frames, self.steps, self._gels, self._touched, self.before, *self._clock, self._case_travel]
         self._launch(
-            move_bodies, (len(self._gels.thickness),), [*inputs, self.motion, self.slots, self.search.poses, self.search.reach]
+            move_bodies,
+            (len(self._gels.thickness),),
+            [*inputs, self.motion, self.slots, self.search.poses, self.search.reach, self.search.closing],
         )
 
     def end(self) -> None:
@@ -272,6 +274,7 @@ def _gels(gels: Sequence[GelpadSpec], bodies: Bodies, device: Any) -> Any:
     result: Any = world.Gels()
     result.thickness = _array(thickness, wp.float64, device)
     result.half = _array([np.multiply(0.5, gel.size) for gel in gels], wp.vec2d, device)
+    result.rest = _array([_rest(gel) for gel in gels], wp.vec2d, device)
     result.modulus = _array([gel.youngs_modulus for gel in gels], wp.float64, device)
     result.shear = _array(np.stack([8.0 * shear / softer, np.pi * shear / thickness], axis=1), wp.vec2d, device)
     result.twist = _array(16.0 / 3.0 * shear, wp.float64, device)
@@ -283,6 +286,13 @@ def _gels(gels: Sequence[GelpadSpec], bodies: Bodies, device: Any) -> Any:
     )
     result.carrier = _array(bodies.carrier, wp.int32, device)
     return result
+
+
+def _rest(gel: GelpadSpec) -> tuple[float, float]:
+    """Greatest slope of a gel's dome, and distance of its corners from the origin [m]."""
+    half = np.multiply(0.5, gel.size)
+    slopes = [u / np.sqrt(radius * radius - u * u) for u, radius in zip(half, gel.dome_radius, strict=True)]
+    return float(np.hypot(*slopes)), float(np.hypot(np.hypot(*half), gel.sag(*half)))
 
 
 def _touched(bodies: Bodies, device: Any) -> Any:

@@ -1,7 +1,8 @@
 """Motion of bodies and other gels in the frames of pads, and how far it may reach.
 
 All points of a body stay in a ball about its origin, which for a half-space is taken as 1 m. From the greatest speed of such a point
-follow the reach of the search, and the step in which a body beside a case comes no farther than MuJoCo's own margin there.
+follow the reach of the search, and the step in which a body beside a case comes no farther than MuJoCo's own margin there. A gap that
+cannot close in the step needs no load law: how fast a body closes it over the pad follows from its motion there, along the normal.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -22,6 +23,8 @@ _1 = wp.constant(wp.float64(1.0))
 _2 = wp.constant(wp.float64(2.0))
 _HALF = wp.constant(wp.float64(0.5))
 _INF = wp.constant(wp.float64(float("inf")))
+_ROUNDING = wp.constant(wp.float64(1e-6))
+"""Share by which a gap that cannot close is more than it is by rounding."""
 
 
 @wp.struct
@@ -66,6 +69,36 @@ def closing_push(
     of_pad = wp.dot(push_at(frames, row, pad, point), normal)
     of_body = wp.dot(push_at(frames, row, frame_of(frames, touched, body), point), normal)
     return wp.max(of_pad, _0) + wp.max(-of_body, _0)
+
+
+@wp.func
+def closing_of(
+    frames: Frames, gels: Gels, row: wp.int32, pad: wp.int32, frame: wp.int32, place: wp.vec3d, velocity: wp.vec3d, spin: wp.vec3d,
+    left: wp.float64,
+) -> wp.float64:  # fmt: skip
+    """Least gap [m] that a body cannot close within a time ``left`` [s].
+
+    At any place over the gel. ``place``, ``velocity``, ``spin``: of the body in the pad's frame. A point at a gap g is at most R + g from
+    the pad's origin, so that what closes there is at most A + B g.
+    """
+    slope, far = gels.rest[pad][0], gels.rest[pad][1] + gels.thickness[pad]
+    back = wp.transpose(frames.turn[row, pad])
+    swing = back * frames.swing[row, frame]
+    own = back * frames.push[row, pad]
+    other = wp.cross(swing, place) - back * frames.push[row, frame]
+    turning = wp.length(swing) + wp.length(frames.swing[row, pad])
+    per_gap = left * (wp.length(spin) + left * turning)
+    if per_gap > _HALF:
+        return _INF
+    speed = along_normals(wp.cross(spin, place) - velocity, slope)
+    push = along_normals(own, slope) + along_normals(other, slope)
+    return (left * (speed + left * push) + per_gap * far) / (_1 - per_gap) * (_1 + _ROUNDING) + _ROUNDING * gels.thickness[pad]
+
+
+@wp.func
+def along_normals(vector: wp.vec3d, slope: wp.float64) -> wp.float64:
+    """Most of a vector along any normal of a gel whose slope is at most ``slope``; >= 0."""
+    return wp.max(vector[2], _0) + slope * wp.length(wp.vec2d(vector[0], vector[1]))
 
 
 @wp.func
@@ -162,12 +195,13 @@ def move_bodies(
     slots: Slots,
     poses: wp.array3d(dtype=wp.mat44d),
     reach: wp.array2d(dtype=wp.float64),
+    closing: wp.array3d(dtype=wp.float64),
 ):
     """Motion of everything relative to one pad, poses and reach of the search, empty slots.
 
     ``before`` (B, pads, bodies): poses of the last step, NaN where unknown; it becomes the present ones. ``timestep``: the scene's [s],
     of ``scene_ticks`` ticks. ``case_travel``: greatest travel of a body beside a case in a step [m], less than the gap from which their
-    contact is known.
+    contact is known. ``reach``, ``closing``: as of ``PadSearch``.
     """
     row, pad = wp.tid()
     pads, bodies, env = frames.place.shape[1] - touched.bodies, touched.bodies, steps.envs[row]
@@ -218,6 +252,7 @@ def move_bodies(
                 # Up to the case in one step, along it in short ones.
                 case_step = wp.min(case_step, wp.max(gap, case_travel) / wp.max(speed, wp.float64(1e-12)))
             poses[row, pad, body] = pose
+            closing[row, pad, body] = closing_of(frames, gels, row, pad, frame, place, velocity, spin, left)
             suspect = wp.int32(0)
             if may_pierce(gels, touched, pad, body, pose) or went_far(gels, touched, pad, body, before[env, pad, body], pose):
                 suspect = wp.int32(1)

@@ -33,9 +33,10 @@ class PadSearch:
     along z, convex ones than 20 cells of the last grid and others than two, are measured on finer ones, down to 0.05 mm. The gap of a
     body that does not touch is measured likewise.
 
-    ``poses`` (environments, pads, bodies) of 4 × 4 matrices ``pad_from_body``, ``reach`` (environments, pads) [m] and ``rows`` are Warp
-    arrays on the device. ``launch`` works on them without the host, so that it can be recorded in a CUDA graph; ``contacts`` copies from
-    and to NumPy around it.
+    Warp arrays on the device are ``poses`` (environments, pads, bodies) of 4 × 4 matrices ``pad_from_body``, ``reach`` (environments,
+    pads) [m], ``closing`` (environments, pads, bodies) [m] and ``rows``. Nodes with gaps up to ``reach`` are looked at; a gap from
+    ``reach`` or ``closing`` on is no row. ``launch`` works on them without the host, so that it can be recorded in a CUDA graph;
+    ``contacts`` copies from and to NumPy around it, with all gaps up to ``reach``.
     """
 
     def __init__(
@@ -148,6 +149,7 @@ class PadSearch:
         self.pairs = num_envs * pads * bodies
         self.poses = wp.zeros((num_envs, pads, bodies), dtype=wp.mat44d, device=self.device)
         self.reach = wp.zeros((num_envs, pads), dtype=wp.float64, device=self.device)
+        self.closing = wp.full((num_envs, pads, bodies), np.inf, dtype=wp.float64, device=self.device)
         self.near = wp.zeros(self.pairs, dtype=wp.int32, device=self.device)
         self.ends = wp.zeros(self.pairs, dtype=wp.int32, device=self.device)
         if self._capacity:
@@ -176,7 +178,7 @@ class PadSearch:
         self._near_launch: Any = wp.launch(
             find_near,
             dim=self.near.shape if 0 in self.poses.shape else self.poses.shape,
-            inputs=[self.poses, self.reach, shapes, pads],
+            inputs=[self.poses, self.reach, self.closing, shapes, pads],
             outputs=[self.near],
             device=self.device,
             record_cmd=True,
@@ -185,7 +187,7 @@ class PadSearch:
             measure,
             dim=[self._blocks],
             inputs=[
-                self.poses, self.reach, shapes, pads, self.near, self.ends, self._blocks, self.pairs, self._work, self.rows,
+                self.poses, self.reach, self.closing, shapes, pads, self.near, self.ends, self._blocks, self.pairs, self._work, self.rows,
             ],
             device=self.device,
             block_dim=_LANES,
@@ -194,6 +196,7 @@ class PadSearch:
 
     def _fill(self, poses: np.ndarray, reach: np.ndarray) -> None:
         count = len(poses)
+        self.closing.fill_(np.inf)
         if self.device.is_cpu:
             self.poses.numpy()[:count] = poses
             self.reach.numpy()[:count] = reach

@@ -82,6 +82,7 @@ class Work:
 def find_near(
     poses: wp.array3d(dtype=wp.mat44d),
     reach: wp.array2d(dtype=wp.float64),
+    closing: wp.array3d(dtype=wp.float64),
     shapes: Shapes,
     pads: Pads,
     # outputs
@@ -90,14 +91,14 @@ def find_near(
     """1 for pairs whose boxes come within reach of the pad's, and for poses that are not finite."""
     env, pad, body = wp.tid()
     pose = poses[env, pad, body]
-    result = wp.int32(0)
+    result, closer = wp.int32(0), wp.min(reach[env, pad], closing[env, pad, body])
     if not is_finite(pose):
         result = 1
     else:
-        radius = shapes.ball[body] + reach[env, pad]
+        radius = shapes.ball[body] + closer
         if pose[2, 3] - radius < pads.highest[pad] and pose[2, 3] + radius > -_2 * pads.thickness[pad]:
             for part in range(shapes.first_part[body], shapes.first_part[body + 1]):
-                if lowest_of(shapes, part, pose, pads, pad, reach[env, pad]) < _INF:
+                if lowest_of(shapes, part, pose, pads, pad, closer) < _INF:
                     result = 1
     near[(env * poses.shape[1] + pad) * poses.shape[2] + body] = result
 
@@ -117,10 +118,13 @@ def next_level(level: wp.int32, last: wp.int32, count: wp.int32) -> wp.int32:
 
 @wp.func
 def measure_pair(
-    pose: wp.mat44d, reach: wp.float64, shapes: Shapes, pads: Pads, work: Work, block: wp.int32, lane: wp.int32, lanes: wp.int32,
-    pad: wp.int32, body: wp.int32, row: wp.int32, rows: Rows,
+    pose: wp.mat44d, reach: wp.float64, closing: wp.float64, shapes: Shapes, pads: Pads, work: Work, block: wp.int32, lane: wp.int32,
+    lanes: wp.int32, pad: wp.int32, body: wp.int32, row: wp.int32, rows: Rows,
 ):  # fmt: skip
-    """Fill one row: find depth and place, then a grid with enough nodes for the law."""
+    """Fill one row: find depth and place, then a grid with enough nodes for the law.
+
+    A gap from ``reach`` or ``closing`` [m] on is no row.
+    """
     placed, gaps = work.placed, work.gap[block]
     place_parts(shapes, pads, placed, block, lane, lanes, pose, pad, body, reach)
     total_of(_0)
@@ -137,6 +141,7 @@ def measure_pair(
     if bottom < bond:
         lowest = pierced_at(shapes, pads, placed, block, lane, lanes, pad, _LAST)
     pierced = lowest < _INF
+    closer = wp.where(pierced, reach, wp.min(reach, closing))
 
     mode, level = wp.int32(_SEARCH), wp.int32(_FIRST)
     if convex and pads.pitch[0] <= _HALF * wp.min(width[0], width[1]):
@@ -204,13 +209,13 @@ def measure_pair(
                     box = wp.vec4d(outer)
             if count == 0:
                 bound, around = nodes_below(gaps, lane, nx, ny, least, _NEAR * pitch)
-                beyond = bound >= reach
+                beyond = bound >= closer
                 done = beyond or (level >= _FIRST and least - bound < _CLOSE)
                 if not done and may_zoom == 1:
                     mode = wp.int32(_ZOOM)
                     box = box_around(pads, fx, fy, i0, j0, around, step_x, step_y)
         elif not done and wide and least >= near:
-            beyond = least >= reach + near
+            beyond = least >= closer + near
             done = beyond
             if not done and may_zoom == 1:
                 mode = wp.int32(_ZOOM)
@@ -237,7 +242,7 @@ def measure_pair(
         touch = touch_at(shapes, pads, placed, block, pad, level, i0 + i, j0 + j, least, reach, work.ahead)
         if touch.touching:
             level += 1  # as after the law's nodes
-        elif -touch.depth >= reach:
+        elif -touch.depth >= closer:
             least = _INF
         else:
             mode, level, busy = wp.int32(_LAW), wp.int32(_FIRST), wp.int32(1)
@@ -268,6 +273,7 @@ def measure_pair(
 def measure(
     poses: wp.array3d(dtype=wp.mat44d),
     reach: wp.array2d(dtype=wp.float64),
+    closing: wp.array3d(dtype=wp.float64),
     shapes: Shapes,
     pads: Pads,
     near: wp.array(dtype=wp.int32),
@@ -294,7 +300,9 @@ def measure(
                 rows.pad[row] = pad
                 rows.body[row] = body
             if is_finite(pose):
-                measure_pair(pose, reach[env, pad], shapes, pads, work, block, lane, lanes, pad, body, row, rows)
+                measure_pair(
+                    pose, reach[env, pad], closing[env, pad, body], shapes, pads, work, block, lane, lanes, pad, body, row, rows
+                )
             elif lane == 0:
                 missing_row(rows, row, _NAN, _NAN)
         pair += blocks

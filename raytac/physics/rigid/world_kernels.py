@@ -27,6 +27,8 @@ class Gels:
     thickness: wp.array(dtype=wp.float64)
     half: wp.array(dtype=wp.vec2d)
     """Half edges along x and y [m]."""
+    rest: wp.array(dtype=wp.vec2d)
+    """Greatest slope of the surface at rest, and greatest distance from the origin [m]."""
     modulus: wp.array(dtype=wp.float64)
     """Young's [Pa]."""
     shear: wp.array(dtype=wp.vec2d)

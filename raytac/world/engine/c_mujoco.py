@@ -227,7 +227,7 @@ class CMujoco:
     def _foresee_slides(self, envs: Sequence[int], slides: np.ndarray, lost: np.ndarray) -> None:
         """Solve where a slide may begin or end, until its lift fits the step's last speed."""
         for _ in range(_SOLVES):
-            some = np.flatnonzero(slides & (lost == 0)).tolist()
+            some = (slides & (lost == 0)).nonzero()[0].tolist()
             if not some:
                 return
             for i in some:
