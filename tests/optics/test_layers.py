@@ -32,6 +32,19 @@ def test_sum_of_layers_is_the_image(tracer: Build, options: dict, layers: str) -
     assert 30 < images.rgb.mean() < 220 and images.rgb.std() > 5
 
 
+@pytest.mark.parametrize("layers", ["colour", "led"])
+def test_image_alone_is_that_beside_its_layers(tracer: Build, layers: str) -> None:
+    """Without layers indirect light is gathered for their sum."""
+    spec = like_a_mini()
+    pressed = surface(grid_of(spec), ball(grid_of(spec))[0])
+    alone = tracer(spec, outputs=("rgb",), layers=layers).render(pressed).rgb
+    direct = tracer(spec, outputs=("rgb",), layers=layers, bounce=False).render(pressed).rgb
+    beside = tracer(spec, outputs=("rgb", "layers"), layers=layers).render(pressed).rgb
+    assert alone is not None and direct is not None and beside is not None
+    assert np.abs(alone.astype(int) - beside).max() <= 1
+    assert np.abs(alone.astype(int) - direct).max() > 2
+
+
 @MODES
 def test_layers_of_leds_sum_to_the_layer_of_their_colour(tracer: Build, options: dict) -> None:
     spec = like_a_mini()

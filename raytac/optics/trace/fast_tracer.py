@@ -115,29 +115,34 @@ class FastTracer(Tracer):
         return {name: np.ascontiguousarray(stack[..., g, :]) for g, name in enumerate(self.layer_names)}
 
     def _frame(self, heights: Float, contact: UInt8 | None, inputs: FrameInputs) -> tuple[UInt8, list[Float], UInt8]:
-        mi, channels = self.mi, self._linear(heights, inputs)
+        mi, channels = self.mi, self._linear(heights, inputs, by_layer="layers" in self.outputs)
         linear = [sum(channels[c::3], mi.Float(0)) for c in range(3)]
         rgb = self.response.encode(mi, linear, inputs.own.scale) if "rgb" in self.outputs else mi.UInt8(0)
         return rgb, channels if "layers" in self.outputs else [], mi.UInt8(0)
 
-    def _linear(self, heights: Float, inputs: FrameInputs) -> list[Float]:
-        """Radiance of every channel (3·G), each B·H·W, averaged over the rays of a pixel."""
+    def _linear(self, heights: Float, inputs: FrameInputs, by_layer: bool = True) -> list[Float]:
+        """Radiance of every channel (3·G), each B·H·W, averaged over the rays of a pixel.
+
+        Indirect light is that of its layer, or else all in the first: sums over layers are the same, for less work.
+        """
         mi, layout = self.mi, self.layout
         envs = dr.width(heights) // (layout.nx * layout.ny)
         field = CoatField(mi, layout, inputs.rest, heights)
         bounce, shadow = inputs.own.bounce, inputs.own.shadow
         shares = None if shadow is None else shadow.shares(mi, field, inputs.own.lamps, envs, self.slab)
         radiosity = partial(self._radiosity, shares, inputs)
-        grids = None if bounce is None else bounce.gather_light(mi, field, radiosity, envs)
+        grids = None if bounce is None else bounce.gather_light(mi, field, radiosity, envs, by_layer)
         sums: list[Any] = []
         for a in range(self.config.rays):
             for b in range(self.config.rays):
                 seen = see(mi, field, self.camera, envs, ((a + 0.5) / self.config.rays, (b + 0.5) / self.config.rays))
-                channels = self._shade(seen, shares, grids, inputs)
+                channels = self._shade(seen, shares, grids, inputs, by_layer)
                 sums = [t + c for t, c in zip(sums, channels, strict=True)] if sums else channels
         return [t / self.config.rays**2 for t in sums]
 
-    def _shade(self, seen: PixelSample, shares: list[Any] | None, grids: list[Any] | None, inputs: FrameInputs) -> list[Any]:
+    def _shade(
+        self, seen: PixelSample, shares: list[Any] | None, grids: list[Any] | None, inputs: FrameInputs, by_layer: bool
+    ) -> list[Any]:
         mi, coat = self.mi, self.sensor.coat
         diffuse_albedo = [(1 - coat.specular) * r for r in self._albedo(seen, inputs)]
         out = [mi.Float(0) for _ in range(3 * len(self.layer_names))]
@@ -146,7 +151,7 @@ class FastTracer(Tracer):
             for c in range(3):
                 out[3 * group + c] += share * lamp.power[c] * (diffuse * (diffuse_albedo[c] / dr.pi) + specular * coat.specular)
         if grids is not None and inputs.own.bounce is not None:
-            for k, e in inputs.own.bounce.irradiance(mi, grids, seen):
+            for k, e in inputs.own.bounce.irradiance(mi, grids, seen, by_layer):
                 out[k] += e * ((diffuse_albedo[k % 3] + coat.specular) / dr.pi)
         return out if seen.exit is None else [o * seen.exit for o in out]
 

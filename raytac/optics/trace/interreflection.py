@@ -133,9 +133,21 @@ class BounceField:
         _, _, columns, rows = nodes_in_view(g, camera, thickness)
         return 16 * len(lit) * columns * rows + g.nx * g.ny * (16 + 16 * -(-len(lit) // 4) + 4)
 
-    def gather_light(self, mi: Any, field: CoatField, radiosity: Callable[[PixelSample], list[Any]], envs: Any) -> list[Any]:
-        """(e, v_x, v_y, v_z) of the patches in view, an array a lit channel, by ``radiosity`` B."""
-        g = self.patches
+    def parts(self, by_layer: bool) -> list[tuple[int, list[int]]]:
+        """Channels that are gathered, and places in ``lit`` of those that each sums.
+
+        Those of all layers, or sums over layers: three at most, channels of the first layer then.
+        """
+        if by_layer:
+            return [(k, [place]) for place, k in enumerate(self.lit)]
+        of_camera = [(c, [place for place, k in enumerate(self.lit) if k % 3 == c]) for c in range(3)]
+        return [(c, places) for c, places in of_camera if places]
+
+    def gather_light(
+        self, mi: Any, field: CoatField, radiosity: Callable[[PixelSample], list[Any]], envs: Any, by_layer: bool = True
+    ) -> list[Any]:
+        """(e, v_x, v_y, v_z) of the patches in view, an array of each part, by ``radiosity`` B."""
+        g, parts = self.patches, self.parts(by_layer)
         i = dr.arange(mi.UInt32, envs * (g.nx * g.ny))
         env, ix, iy = i // (g.nx * g.ny), i % g.nx, (i // g.nx) % g.ny
         x, y = g.x0 + g.dx * mi.Float(ix), g.y0 + g.dy * mi.Float(iy)
@@ -148,7 +160,7 @@ class BounceField:
         b = radiosity(PixelSample(env, mi.Point3f(x, y, z), n, mi.Vector3f(0, 0, -1)))
         patches = dr.ravel(mi.Vector4f(z, n.x, n.y, n.z))
         # Four channels a packet, so that one gather brings them.
-        lit = [b[k] for k in self.lit]
+        lit = [sum((b[self.lit[place]] for place in places), mi.Float(0)) for _, places in parts]
         packets = [dr.ravel(mi.Vector4f(*lit[k : k + 4], *[0] * (4 - len(lit[k : k + 4])))) for k in range(0, len(lit), 4)]
         dr.eval(patches, packets)
         left, top, columns, rows = self.view
@@ -181,18 +193,18 @@ class BounceField:
             first = -mi.Int32(dr.sqrt(mi.Float(dr.maximum(REACH**2 - following * following, 0))))
             return dr.select(ends, first, ox + 1), following, out
 
-        start = (mi.Int32(0), mi.Int32(-REACH), [dr.zeros(mi.Vector3f, dr.width(i)) for _ in self.lit])
+        start = (mi.Int32(0), mi.Int32(-REACH), [dr.zeros(mi.Vector3f, dr.width(i)) for _ in parts])
         *_, gathered = dr.while_loop(start, lambda ox, oy, v: oy <= REACH, add, label="coat bounce")
         node = i - env * (g.nx * g.ny)
         result = []
-        for base, v in zip(self.case, gathered, strict=True):
-            e = dr.gather(mi.Vector4f, base, node)
+        for (_, places), v in zip(parts, gathered, strict=True):
+            e: Any = sum((dr.gather(mi.Vector4f, self.case[place], node) for place in places), mi.Vector4f(0))
             result.append(dr.ravel(mi.Vector4f(e.x, e.y + v.x, e.z + v.y, e.w + v.z)))
         dr.eval(result)
         return result
 
-    def irradiance(self, mi: Any, grids: list[Any], seen: PixelSample) -> list[tuple[int, Any]]:
-        """(channel, E [radiance · sr]) of the lit channels at the points and normals of ``seen``."""
+    def irradiance(self, mi: Any, grids: list[Any], seen: PixelSample, by_layer: bool = True) -> list[tuple[int, Any]]:
+        """(channel, E [radiance · sr]) of ``parts`` at the points and normals of ``seen``."""
         n, g, (left, top, columns, rows) = seen.n, self.patches, self.view
         k, wx, wy = g.cell(mi, 0, seen.p.x, seen.p.y)
         # Within the patches in view, whatever the ray has hit.
@@ -203,4 +215,5 @@ class BounceField:
         view = replace(g, nx=columns, ny=rows)
         i = (seen.env * rows + mi.UInt32(iy)) * columns + mi.UInt32(ix)
         fields = (bilinear(view.corners(mi.Vector4f, grid, i), wx, wy) for grid in grids)
-        return [(c, dr.maximum(e.x + n.x * e.y + n.y * e.z + n.z * e.w, 0)) for c, e in zip(self.lit, fields, strict=True)]
+        channels = [channel for channel, _ in self.parts(by_layer)]
+        return [(c, dr.maximum(e.x + n.x * e.y + n.y * e.z + n.z * e.w, 0)) for c, e in zip(channels, fields, strict=True)]
