@@ -257,7 +257,7 @@ def figure(rows: dict[str, dict[str, float]]) -> Figure:
         left.plot([100.0 * rows[case][kind] for case in names], range(len(names)), "o", color=colour, label=kind, markersize=4)
     left.set_yticks(range(len(names)), [case.replace(".", " ", 1) + " mm" for case in names], fontsize=7)
     left.set(xlabel="force, off the layer's [%]", xlim=(-80, 40))
-    left.axvline(0.0, color="k", linewidth=0.6)
+    left.axvline(0.0, color="k", linewidth=0.6, label="layer")
     left.invert_yaxis()
     left.legend(fontsize=7, loc="lower left")
     for axis, stem, places, depth, title in (

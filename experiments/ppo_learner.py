@@ -340,7 +340,7 @@ def _checked_moments(name: str, rms: RunningMeanStd, saved: object) -> tuple[np.
 
 
 class LearnerEpisodes:
-    """Held-out episodes of a learner's deterministic policy (``raytac.learn.Episodes``)."""
+    """Held-out episodes of a learner's deterministic policy (``raytac.learn.ShownEpisodes``)."""
 
     def __init__(self, learner: Learner) -> None:
         """Freeze the normaliser."""

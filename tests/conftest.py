@@ -5,6 +5,8 @@ from __future__ import annotations
 from tests import one_thread  # isort: skip  (before NumPy)
 
 import math
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -157,6 +159,18 @@ def sensor_spec() -> SensorSpec:
 @pytest.fixture(scope="session")
 def ball_surface() -> GelSurface:
     return make_surface()
+
+
+@pytest.fixture(scope="module")
+def few_cells() -> Iterator[None]:
+    """Soft pads of fewer tetrahedra, for files that say nothing of a mesh's accuracy: coarse of a quarter, medium as coarse is."""
+    from raytac.physics.soft import mesh
+
+    coarse = mesh.PAD_LEVELS["coarse"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(mesh.PAD_LEVELS, "medium", coarse)
+        patch.setitem(mesh.PAD_LEVELS, "coarse", replace(coarse, cell=2.5e-3, layers=2, layer_spread=2.0))
+        yield
 
 
 @pytest.fixture

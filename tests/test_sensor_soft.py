@@ -20,6 +20,7 @@ from raytac.sensor import TactileSensor
 from raytac.specs import load_press
 from raytac.specs.press import StageSpec
 
+pytestmark = pytest.mark.usefixtures("few_cells")
 OUTPUTS = ("height", "wrench", "traction")
 SCENE = replace(load_press("sphere"), trajectory=(StageSpec("indent", depth=0.3e-3),))
 

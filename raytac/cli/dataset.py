@@ -73,8 +73,8 @@ class DatasetArgs(SolverOptions):
     """Also write the whole data set as LeRobot (videos alone), HDF5 or Zarr, beside its shards.
 
     Needs raytac[export]."""
-    fps: float = 30.0
-    """With --export lerobot: frames a second at which a press is shown."""
+    fps: float | None = None
+    """With --export lerobot: frames a second at which a press is shown; 30 if not given."""
     verify: bool = False
     """Render nothing: compare all files of the data set with their checksums."""
 
@@ -89,9 +89,9 @@ class DatasetArgs(SolverOptions):
             raise InputError("sheet", value=self.sheet, rule="must be a whole number >= 0")
         if self.sheet and not {"rgb", "height"} & set(plan.sweep.outputs):
             raise InputError("sheet", value=self.sheet, rule="shows images and heights: outputs must have 'rgb' or 'height'")
+        fps = self._checked_fps()
         if self.export is not None:
             check_export(self.export, out, plan.sweep)
-            check_number("fps", self.fps, "(0, inf)", "Hz")
         report = render_dataset(
             plan,
             out,
@@ -106,7 +106,7 @@ class DatasetArgs(SolverOptions):
         )
         if self.sheet:
             write_png(out / "sheet.png", contact_sheet(PressDataset(out), self.sheet))
-        exported = [] if self.export is None else export_presses(out, self.export, fps=self.fps, progress=True)
+        exported = [] if self.export is None else export_presses(out, self.export, fps=fps, progress=True)
         metrics = {
             "command": "dataset",
             "sweep": plan.sweep.name,
@@ -126,6 +126,14 @@ class DatasetArgs(SolverOptions):
         write_metrics(out / "metrics.json", metrics | {"wall_s": time.perf_counter() - start})
         print(f"{plan.sweep.count} presses, {report.failed} failed (manifest.parquet says why): {out}")
         return print_paths(exported)
+
+    def _checked_fps(self) -> float:
+        """Frames a second of the export. Raises InputError where nothing has such a rate."""
+        if self.fps is None:
+            return 30.0
+        if self.export != "lerobot":
+            raise InputError("fps", value=self.fps, rule="belongs to --export lerobot")
+        return check_number("fps", self.fps, "(0, inf)", "Hz")
 
     def _verify(self, out: Path) -> int:
         """Compare the files with their checksums; ``InputError`` for a shard that is not whole."""

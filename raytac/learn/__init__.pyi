@@ -4,6 +4,7 @@ from .evaluation import Episodes as Episodes
 from .evaluation import Evaluation as Evaluation
 from .evaluation import Outcome as Outcome
 from .evaluation import Player as Player
+from .evaluation import ShownEpisodes as ShownEpisodes
 from .evaluation import append_row as append_row
 from .evaluation import evaluate as evaluate
 from .evaluation import keep_rows as keep_rows
@@ -14,6 +15,7 @@ from .players import find_player as find_player
 from .players import shown_beside as shown_beside
 from .playing import Film as Film
 from .playing import film_episode as film_episode
+from .playing import gif_pictures as gif_pictures
 from .playing import moments as moments
 from .playing import play_policy as play_policy
 from .playing import success_rate as success_rate

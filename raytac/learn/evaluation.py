@@ -41,6 +41,18 @@ class Episodes(Protocol):
     @property
     def num_envs(self) -> int: ...
 
+    def reset(self, seed: int) -> None:
+        """Begin all episodes, environment b with seed + b."""
+        ...
+
+    def step(self) -> Outcome:
+        """One action in all environments."""
+        ...
+
+
+class ShownEpisodes(Episodes, Protocol):
+    """Episodes that can be drawn."""
+
     @property
     def control_timestep(self) -> float:
         """Duration of a step [s]."""
@@ -49,14 +61,6 @@ class Episodes(Protocol):
     @property
     def sensors(self) -> tuple[str, ...]:
         """Names of the sensors that a picture shows."""
-        ...
-
-    def reset(self, seed: int) -> None:
-        """Begin all episodes, environment b with seed + b."""
-        ...
-
-    def step(self) -> Outcome:
-        """One action in all environments."""
         ...
 
     def picture(self) -> np.ndarray:
@@ -72,7 +76,7 @@ class Player(Protocol):
     physics: str
     """Pads that it was trained on."""
 
-    def episodes(self, num_envs: int, *, physics: str, device: str, shown: OpticsConfig | str | None = None) -> Episodes:
+    def episodes(self, num_envs: int, *, physics: str, device: str, shown: OpticsConfig | str | None = None) -> ShownEpisodes:
         """Environments on such pads; with ``shown``, an optical mode, they can be drawn."""
         ...
 

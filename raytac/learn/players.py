@@ -11,7 +11,7 @@ import numpy as np
 from raytac.envs.flat_policy import FlatPolicy
 from raytac.envs.scripted import SCRIPTED
 from raytac.errors import InputError
-from raytac.learn.evaluation import KINDS, Episodes, Outcome
+from raytac.learn.evaluation import KINDS, Outcome, ShownEpisodes
 from raytac.learn.policies import shipped_policies
 from raytac.observe import MODALITIES, ObservationSettings
 from raytac.optics.base import OpticsConfig
@@ -64,7 +64,7 @@ class PolicyPlayer:
         self.policy = FlatPolicy(path)
         self.name, self.task, self.physics = path.stem, self.policy.task, self.policy.physics
 
-    def episodes(self, num_envs: int, *, physics: str, device: str, shown: OpticsConfig | str | None = None) -> Episodes:
+    def episodes(self, num_envs: int, *, physics: str, device: str, shown: OpticsConfig | str | None = None) -> ShownEpisodes:
         """As ``Player``; the policy is given what it was trained with, whatever is shown."""
         options: dict[str, Any] = {"physics": physics, "device": device}
         if shown is not None:
@@ -108,7 +108,7 @@ class ScriptedPlayer:
             raise InputError("task", value=task, rule="must be a known task", choices=tuple(SCRIPTED))
         self.name, self.task = f"{task}_scripted", task
 
-    def episodes(self, num_envs: int, *, physics: str, device: str, shown: OpticsConfig | str | None = None) -> Episodes:
+    def episodes(self, num_envs: int, *, physics: str, device: str, shown: OpticsConfig | str | None = None) -> ShownEpisodes:
         """As ``Player``."""
         options: dict[str, Any] = {"tactile": None, "physics": physics, "device": device}
         if shown is not None:

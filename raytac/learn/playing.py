@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,6 +40,11 @@ class Film:
     """Time from one picture to the next [s]."""
     sensors: tuple[str, ...]
     """Names of the sensors in the order of their columns."""
+
+
+def gif_pictures(frames: Sequence[np.ndarray]) -> Sequence[np.ndarray]:
+    """Pictures of a GIF: the last one and every third before it."""
+    return frames[(len(frames) - 1) % _GIF_EVERY :: _GIF_EVERY]
 
 
 def success_rate(
@@ -120,7 +126,7 @@ def play_policy(
             except BackendError as error:
                 log.warning("no film: %s", error)
             else:
-                pictures = made.frames if mp4 else made.frames[::_GIF_EVERY]
+                pictures = made.frames if mp4 else gif_pictures(made.frames)
                 rate = 1.0 / made.step if mp4 else 1.0 / (_GIF_EVERY * made.step)
                 write_atomic(folder / ("film.mp4" if mp4 else "film.gif"), (mp4_bytes if mp4 else gif_bytes)(pictures, rate))
                 write_strip(made, folder / "strip.png")

@@ -30,7 +30,7 @@ from raytac.io.atomic import write_atomic
 from raytac.io.folder import FolderLock
 from raytac.io.metrics import VERSIONED, Metric, read_metrics, versions, write_metrics
 from raytac.io.options import parse_names, parse_seeds
-from raytac.learn.evaluation import HELD_OUT, KINDS, Evaluation, append_row, keep_rows, segment_seed
+from raytac.learn.evaluation import KINDS, Evaluation, Outcome, append_row, evaluate, keep_rows, segment_seed
 from raytac.learn.settings import DEVIATION_MOST, HISTORY, STEPS, PpoSettings
 from raytac.report.measure import machine
 
@@ -137,29 +137,13 @@ class Training:
 
     def evaluate(self, episodes: int, first_seed: int = 0) -> Evaluation:
         """Play held-out episodes, then begin new ones of the training."""
-        env, policy = self.env, self.ppo.get_policy()
-        returns, lengths, successes, failures, played = [], [], 0, 0, 0
         with torch.inference_mode():
-            while played < episodes:
-                observation = env.reset(HELD_OUT + first_seed + played)
-                running = torch.arange(env.num_envs, device=self.device) < episodes - played
-                played, earned, step = played + int(running.sum()), torch.zeros(env.num_envs, device=self.device), 0
-                while running.any():
-                    observation, reward, done, extras = env.step(policy(observation))
-                    earned, step, ended = earned + reward * running, step + 1, running & (done > 0)
-                    returns += (earned[ended] / env.reward_scale).tolist()
-                    lengths += [step] * int(ended.sum())
-                    successes, failures = (
-                        successes + int(extras["success"][ended].sum()),
-                        failures + int(extras["failed"][ended].sum()),
-                    )
-                    running &= ~ended
+            result = evaluate(_TrainingEpisodes(self.env, self.ppo.get_policy()), episodes, first_seed=first_seed)
         self._begin_episodes()
-        result = Evaluation(played, successes, float(np.mean(returns)), float(np.mean(lengths)), failures)
-        low, high = result.interval
+        low, high, played = *result.interval, result.episodes
         row = {
-            "steps": self.steps, "wall_s": round(self.wall_s, 2), "episodes": played, "success": successes / played,
-            "low": round(low, 4), "high": round(high, 4), "failed": failures, "return": round(result.mean_return, 2),
+            "steps": self.steps, "wall_s": round(self.wall_s, 2), "episodes": played, "success": result.successes / played,
+            "low": round(low, 4), "high": round(high, 4), "failed": result.failures, "return": round(result.mean_return, 2),
             "length": round(result.mean_length, 1),
         }  # fmt: skip
         append_row(self.folder / "evaluation.csv", row)
@@ -186,6 +170,21 @@ class Training:
         if self._writer is not None:
             self._writer.close()
         self.env.close()
+
+
+class _TrainingEpisodes:
+    """Environments of a training under its deterministic policy."""
+
+    def __init__(self, env: RslVecEnv | RslWarpEnv, policy: Any) -> None:
+        self._env, self._policy, self.num_envs = env, policy, env.num_envs
+
+    def reset(self, seed: int) -> None:
+        self._observation = self._env.reset(seed)
+
+    def step(self) -> Outcome:
+        self._observation, reward, done, extras = self._env.step(self._policy(self._observation))
+        values = reward / self._env.reward_scale, done, extras["success"], extras["failed"]
+        return Outcome(*torch.stack([value.double() for value in values]).cpu().numpy())
 
 
 def train_policies(args: PpoSettings, out: Path, *, device: str = "auto") -> dict[str, Metric]:

@@ -63,7 +63,7 @@ def test_exports_lie_beside_the_shards(kind: str, name: str, tmp_path: Path, cap
         "--count",
         "2",
     ]
-    assert main([*asked, "--export", kind, "--fps", "5"]) == 0
+    assert main([*asked, "--export", kind, *(["--fps", "5"] if kind == "lerobot" else [])]) == 0
     assert str(out / name) in capsys.readouterr().out
     height = PressDataset(out)[1]["height"]
     if kind == "lerobot":
@@ -93,7 +93,9 @@ def test_what_cannot_be_exported_is_refused_before_rendering(
     for options, text in (
         (["--export", "lerobot"], "give it frames_per_stage"),
         (["--export", "csv"], "did you mean|choose from"),
-        (["--export", "hdf5", "--fps", "0"], "fps = 0"),
+        (["--export", "lerobot", "--fps", "0"], "fps = 0"),
+        (["--export", "hdf5", "--fps", "5"], "fps = 5.* belongs to --export lerobot"),
+        (["--fps", "5"], "fps = 5.* belongs to --export lerobot"),
     ):
         assert main([*asked, *options]) == 2
         assert re.search(text, capsys.readouterr().err)

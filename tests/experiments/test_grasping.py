@@ -9,6 +9,8 @@ from experiments import endurance, lift, twist
 from raytac.errors import InputError, RaytacError
 from raytac.io.metrics import read_metrics
 
+pytestmark = pytest.mark.usefixtures("few_cells")
+
 
 def test_lift_holds_a_cube_with_both_pads(tmp_path):
     args = lift.Args(out=tmp_path / "lift", cases=("cube",), physics=("ipc",), quick=True, device="cpu")

@@ -15,6 +15,8 @@ from raytac.envs import FlatPolicy, read_tensors
 from raytac.errors import InputError
 from raytac.io import read_metrics
 
+pytestmark = pytest.mark.usefixtures("few_cells")
+
 
 def written(path: Path, program: bytes) -> Path:
     """A file like one of ``torch.save`` with this pickle in it, and two numbers."""

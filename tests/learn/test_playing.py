@@ -21,6 +21,7 @@ from raytac.learn import (
     PpoSettings,
     ScriptedPlayer,
     find_player,
+    gif_pictures,
     moments,
     play_policy,
     shipped_policies,
@@ -94,6 +95,12 @@ def test_a_shipped_policy_is_filmed_by_name(tmp_path: Path) -> None:
         film.seek(film.n_frames - 1)  # type: ignore[attr-defined]
         assert np.abs(np.asarray(film.convert("RGB"), float) - first).mean() > 1.0
     assert (tmp_path / "strip.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 9, 100])
+def test_a_gif_ends_with_the_last_picture(count: int) -> None:
+    shown = [int(picture) for picture in gif_pictures([np.array(k) for k in range(count)])]
+    assert shown[-1] == count - 1 and shown[0] < 3 and set(np.diff(shown)) <= {3}
 
 
 def test_bad_input(tmp_path: Path) -> None:

@@ -9,11 +9,16 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError, SpecError
+from raytac.physics.soft.mesh import pad_mesh
 from raytac.physics.soft.press_solver import PressSolver
 from raytac.physics.soft.scene import SoftScene
 from raytac.physics.soft.settings import PressControl
 from raytac.specs.press import StageSpec
-from tests.physics.soft_presses import indent, press, soft, uncorrected
+from tests.physics.soft_presses import SENSOR, indent, press, soft, uncorrected
+
+pytestmark = pytest.mark.usefixtures("few_cells")
+COARSE = pad_mesh(SENSOR.gelpad, "coarse")
+"""Steps of a shear are resolved by its cells."""
 
 
 def test_a_batch_is_its_single_presses_and_lost_environments_fail_alone():
@@ -132,11 +137,11 @@ def test_turn_and_shear_by_environment_are_those_of_scenes_of_their_own():
     turns = np.array([[1.0, 0.0, 0.0, 0.0], [math.cos(0.6), 0.0, math.sin(0.6), 0.0]])
     shears = np.array([[0.1e-3, 0.0], [0.0, -0.2e-3]])
     stages = indent(0.4e-3), StageSpec("shear", shear=(1e-3, 1e-3))
-    many = soft(press(*stages, kind="cylinder"), num_envs=2, rotations=turns, shears=shears)
+    many = soft(press(*stages, kind="cylinder"), num_envs=2, level=COARSE, rotations=turns, shears=shears)
     state = many.peak(many.run())
     for b in range(2):
         scene = press(indent(0.4e-3), StageSpec("shear", shear=tuple(shears[b])), kind="cylinder")
-        one = soft(replace(scene, object=replace(scene.object, quaternion=tuple(turns[b]))))
+        one = soft(replace(scene, object=replace(scene.object, quaternion=tuple(turns[b]))), level=COARSE)
         alone = one.peak(one.run())
         # A batch takes as many steps as the longest of its ways asks for.
         assert np.abs(alone.surface.height[0] - state.surface.height[b]).max() < 3e-6

@@ -12,6 +12,8 @@ from raytac.errors import InputError, OverlapError
 from raytac.specs import load_sensor, load_task
 from raytac.world.world import TactileWorld
 
+pytestmark = pytest.mark.usefixtures("few_cells")
+
 
 def shifted(world: TactileWorld, body: str, rows: int, by: float) -> np.ndarray:
     at = np.repeat(world.state().world_from_body[body][:1], rows, axis=0)

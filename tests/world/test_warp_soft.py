@@ -15,7 +15,8 @@ from raytac.world.engine.choice import WarpEngine
 
 pytest.importorskip("mujoco_warp")
 
-pytestmark = [pytest.mark.timeout(1200), pytest.mark.solver]  # the first test compiles MuJoCo Warp for the CPU: minutes
+# The first test compiles MuJoCo Warp for the CPU: minutes.
+pytestmark = [pytest.mark.timeout(1200), pytest.mark.solver, pytest.mark.usefixtures("few_cells")]
 DEVICES = [
     "cpu",
     pytest.param("cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not wp.is_cuda_available(), reason="needs CUDA")]),
