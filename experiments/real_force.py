@@ -9,8 +9,8 @@ The file has columns ``depth_mm`` and ``force_n``; lines that begin with # are s
 - ``force.PAD.DEPTH.held_out_error``: the same with Young's modulus times one factor, fitted to the **other** depths (least relative
   squares; forces of a press are proportional to the modulus). ``force.PAD.modulus_kpa`` is the modulus fitted to all depths.
 - ``force.PAD.worst``, ``….held_out_worst``: greatest error of any depth.
-- ``force.PAD.poisson_NU.…``, ``force.PAD.friction_MU.…``: the same with another Poisson's ratio or friction than the sensor's. The rigid
-  pad's law knows no friction under a normal load.
+- ``force.PAD.poisson_NU.…``, ``force.PAD.friction_MU.…``, ``force.PAD.poisson_NU.friction_MU.…``: the same with another Poisson's ratio
+  or friction than the sensor's, and both. The rigid pad's law knows no friction under a normal load.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Annotated
 
@@ -51,6 +52,8 @@ class Args(CommonOptions):
     """Poisson's ratios to try besides the sensor's, joined by commas."""
     frictions: str = ""
     """Coefficients of friction to try besides the sensor's, joined by commas."""
+    modulus_kpa: float | None = None
+    """Young's modulus in place of the sensor's [kPa]."""
     sensor: str = "gelsight_mini"
     """Name of a shipped sensor, or path of a sensor file."""
 
@@ -109,14 +112,17 @@ def main(args: Args) -> None:
     check_number("radius_mm", args.radius_mm, "(0, 100]", "mm")
     measured, sensor = Measured.read(args.data), load_sensor(args.sensor)
     levels = parse_names(args.levels, "levels", PADS) if args.levels else ()
+    if args.modulus_kpa is not None:
+        modulus = 1e3 * check_number("modulus_kpa", args.modulus_kpa, "(0, 1e6]", "kPa")
+        sensor = replace(sensor, gelpad=replace(sensor.gelpad, youngs_modulus=modulus))
+    ratios = _numbers("poisson_ratios", args.poisson_ratios, "[0, 0.5)")
+    frictions = _numbers("frictions", args.frictions, "[0, 10]")
     variants = [("", sensor)]
-    for option, field, text, interval in (
-        ("poisson_ratios", "poisson_ratio", args.poisson_ratios, "[0, 0.5)"),
-        ("frictions", "friction", args.frictions, "[0, 10]"),
-    ):
-        for value in _numbers(option, text, interval):
-            changed = replace(sensor, gelpad=replace(sensor.gelpad, **{field: value}))
-            variants.append((f".{field.removesuffix('_ratio')}_{value:g}", changed))
+    for ratio, friction in list(product((None, *ratios), (None, *frictions)))[1:]:
+        changes = {"poisson_ratio": ratio, "friction": friction}
+        changes = {name: value for name, value in changes.items() if value is not None}
+        suffix = "".join(f".{name.removesuffix('_ratio')}_{value:g}" for name, value in changes.items())
+        variants.append((suffix, replace(sensor, gelpad=replace(sensor.gelpad, **changes))))
     device = resolve_device(args.device, ray_tracing=False)
     ball = ObjectSpec("sphere", {"radius": args.radius_mm / 1e3}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)
     scene = PressScene("ball", ball, (StageSpec("indent", depth=float(measured.depth[-1])),))
@@ -134,7 +140,7 @@ def main(args: Args) -> None:
         for name in ("rigid", *levels):
             for suffix, own in variants:
                 if name == "rigid":
-                    if suffix.startswith(".friction"):
+                    if ".friction" in suffix:
                         continue
                     force = pressed_forces(RigidPad(own, scene, pitch=PITCH), measured.depth)
                 else:

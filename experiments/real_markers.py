@@ -1,6 +1,6 @@
 """How near do marker models come to a real drag? Dots of two photographs, a pressed ball and the same dragged, against every model.
 
-    python experiments/real_markers.py fots_markers --circle-px 139,120,38 --ball-radius-mm 3 --pitch-mm 0.0532 --out runs/real_markers
+    python experiments/real_markers.py fots_markers --circle-px 139,120,45 --ball-radius-mm 3 --pitch-mm 0.0532 --out runs/real_markers
 
 The folder holds ``0.png`` (pressed), ``1.png`` (pressed and dragged), and ``0.csv`` and ``1.csv``: about where each dot is, columns ``Mx``,
 ``My`` (a start) and ``dx``, ``dy`` (its motion) [px], a row a dot in the same order. Dots are found again below a pixel as centroids of

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,14 @@ def test_a_modulus_is_recovered_from_forces_of_the_pad_itself(tmp_path: Path) ->
         assert metrics[f"force.rigid.{depth:g}.held_out_error"] == pytest.approx(0.0, abs=1e-6)
     # Another Poisson's ratio changes how force grows with depth, which no modulus takes back.
     assert float(metrics["force.rigid.poisson_0.3.held_out_worst"]) > 0.02
+    # With the modulus that is right, and a friction that the rigid pad's law does not know, nothing is off.
+    right = replace(args, modulus_kpa=1.25 * 430.0, poisson_ratios="0.3", frictions="0.5", out=tmp_path / "right")
+    real_force.main(right)
+    metrics = read_metrics(tmp_path / "right" / "metrics.json")
+    assert float(metrics["force.rigid.worst"]) < 1e-6 < float(metrics["force.rigid.poisson_0.3.worst"])
+    assert not [key for key in metrics if "friction_" in key]
+    with pytest.raises(InputError, match="modulus_kpa"):
+        real_force.main(replace(args, modulus_kpa=0.0))
 
 
 def test_a_fitted_modulus_is_of_the_other_depths() -> None:

@@ -15,8 +15,8 @@ PITCH = 0.2e-3
 FRICTIONLESS = replace(SENSOR, gelpad=replace(SENSOR.gelpad, friction=0.0))
 
 
-def press(*stages, kind="sphere", position=(0.0, 0.0), moves="object", **settings):
-    params = {"sphere": {"radius": RADIUS}, "cylinder": {"radius": 3e-3, "length": 4e-3}, "none": {}}[kind]
+def press(*stages, kind="sphere", position=(0.0, 0.0), moves="object", radius=RADIUS, **settings):
+    params = {"sphere": {"radius": radius}, "cylinder": {"radius": 3e-3, "length": 4e-3}, "none": {}}[kind]
     return PressScene("test", ObjectSpec(kind, params, (*position, 0.0), IDENTITY, 0.05, **settings), stages, moves)
 
 
