@@ -13,7 +13,7 @@ from raytac.world.world import TactileWorld
 _SHARP = 2
 """Samples of a pixel along each side."""
 _SHADOWS = 2048
-"""Texels along a side of the map of shadows: without a graphics card it takes half of the time."""
+"""Texels along a side of the map of shadows: what a CPU draws quickly."""
 _SKY = np.array((238.0, 241.0, 245.0), np.float32)
 """Colour of the background: one, since a GIF has few."""
 _FLOOR, _LINES = (0.83, 0.84, 0.85, 1.0), (0.70, 0.71, 0.73, 1.0)
