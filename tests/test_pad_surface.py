@@ -49,6 +49,12 @@ def pressed(mapped: bool, physics: str, optics: str = "raytrace") -> TactileFram
     return sensor.press(BALL, offset=BESIDE)
 
 
+def test_a_map_every_fifth_of_a_millimetre_is_the_dome_within_a_fifth_of_a_nanometre() -> None:
+    dome = load_sensor("gelsight_dome").gelpad
+    x, y = np.random.default_rng(0).uniform(-0.5, 0.5, (2, 2000)) * np.array(dome.size)[:, None]
+    assert np.abs(as_map(load_sensor("gelsight_dome")).gelpad.sag(x, y) - dome.sag(x, y)).max() < 0.2e-9
+
+
 @pytest.mark.parametrize("physics", ["rigid", "ipc"])
 @pytest.mark.filterwarnings("ignore::raytac.physics.soft.contact_width.NarrowContactWarning")
 def test_a_map_of_a_dome_presses_as_the_dome(physics: str) -> None:

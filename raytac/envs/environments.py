@@ -18,11 +18,12 @@ from raytac.envs.task_rules import Task
 from raytac.errors import InputError
 from raytac.gel.surface import chosen_envs
 from raytac.observe import gymnasium_space
+from raytac.specs.sensor_check import view_edges
 
 _RENDER_MODES = ("rgb_array",)
 _GAIN = 4.0
-"""Length of a drawn arrow over the marker's displacement."""
-_PAPER, _INK, _DOT = (250, 250, 250), (43, 108, 176), (120, 120, 120)
+"""Length of a drawn arrow over the marker's displacement, and of the difference from rest."""
+_PAPER, _INK, _DOT, _PLAIN = (250, 250, 250), (20, 60, 130), (90, 90, 90), 190
 
 
 class _Task:
@@ -264,7 +265,8 @@ def serve_vector(pipe: Connection, kind: type[TactileVectorEnv], num_envs: int, 
 class EnvironmentPicture:
     """Pictures of a batch: the scene, and beside it what each sensor observes.
 
-    Of the modalities the image is shown, and markers with arrows of 4 times their displacement, pad frame with x to the right and y up.
+    Of the modalities the image is shown, and markers with arrows of 4 times their displacement, pad frame with x to the right and y up,
+    over 4 times the image's difference from rest.
     """
 
     def __init__(self, batch: TaskBatch, *, height: int = 240) -> None:
@@ -272,6 +274,8 @@ class EnvironmentPicture:
         from raytac.world.scene_camera import SceneCamera
 
         self._batch, self._height = batch, height
+        self._rest: dict[str, np.ndarray] = {}
+        """Images at rest by sensor, which differences are from."""
         # Near enough to see a pad of two centimetres, far enough that tool and body, a long pole too, stay in view.
         tool, body = batch.start_tool[:3, 3], batch.start_body[:3, 3]
         distance = 0.45 + 1.5 * float(np.linalg.norm(tool - body))
@@ -284,10 +288,11 @@ class EnvironmentPicture:
         columns = [self._camera.draw(env, [self._batch.goal[env]])]
         for name in self._batch.observers:
             panels = []
-            if f"{name}_rgb" in observation:
-                panels.append(_enlarged(observation[f"{name}_rgb"][env][..., -3:], self._height))
+            image = observation[f"{name}_rgb"][env][..., -3:] if f"{name}_rgb" in observation else None
+            if image is not None:
+                panels.append(_enlarged(image, self._height))
             if f"{name}_markers" in observation:
-                panels.append(self._markers(name, env, observation[f"{name}_markers"][env]))
+                panels.append(self._markers(name, env, observation[f"{name}_markers"][env], image))
             if panels:
                 columns.append(_column(panels, self._height))
         return np.concatenate(columns, axis=1)
@@ -296,7 +301,15 @@ class EnvironmentPicture:
         """Free the renderer."""
         self._camera.close()
 
-    def _markers(self, name: str, env: int, values: np.ndarray) -> np.ndarray:
+    def _difference(self, name: str, image: np.ndarray) -> np.ndarray:
+        """Enlarged difference of an 8-bit image (H, W, 3) from rest, about a light grey."""
+        if name not in self._rest:
+            rest = self._batch.world.sensors[name].rest().rgb[0]  # type: ignore[index]
+            self._rest[name] = _resized(rest, image.shape[1], image.shape[0])
+        change = _GAIN * (image.astype(float) - self._rest[name])
+        return np.clip(_PLAIN + change, 0, 255).astype(np.uint8)
+
+    def _markers(self, name: str, env: int, values: np.ndarray, seen: np.ndarray | None) -> np.ndarray:
         from PIL import Image, ImageDraw
 
         sensor = self._batch.world.sensors[name]
@@ -313,6 +326,11 @@ class EnvironmentPicture:
         def pixel(point: np.ndarray) -> tuple[float, float]:
             return width / 2 + factor * float(point[0]), height / 2 - factor * float(point[1])
 
+        if seen is not None:
+            (left, right), (top, bottom) = view_edges(sensor.spec)
+            low, high = pixel(np.array([left, bottom])), pixel(np.array([right, top]))  # turned over: y goes up here
+            span = round(high[0]) - round(low[0]), round(high[1]) - round(low[1])
+            image.paste(Image.fromarray(_resized(self._difference(name, seen)[::-1], *span)), (round(low[0]), round(low[1])))
         for start, arrow in zip(rest, displacement, strict=True):
             x, y = pixel(start)
             draw.ellipse((x - 1, y - 1, x + 1, y + 1), fill=_DOT)
@@ -322,9 +340,13 @@ class EnvironmentPicture:
 
 def _enlarged(image: np.ndarray, height: int) -> np.ndarray:
     """The image scaled to ``height`` [px]."""
+    return _resized(image, max(1, round(image.shape[1] * height / len(image))), height)
+
+
+def _resized(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """The image at another size [px]."""
     from PIL import Image
 
-    width = max(1, round(image.shape[1] * height / len(image)))
     return np.asarray(Image.fromarray(image).resize((width, height), Image.Resampling.BILINEAR))
 
 

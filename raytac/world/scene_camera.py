@@ -10,8 +10,10 @@ import numpy as np
 from raytac.errors import BackendError, InputError
 from raytac.world.world import TactileWorld
 
-_SHARP = 3
+_SHARP = 2
 """Samples of a pixel along each side."""
+_SHADOWS = 2048
+"""Texels along a side of the map of shadows: what a CPU draws quickly."""
 _SKY = np.array((238.0, 241.0, 245.0), np.float32)
 """Colour of the background: one, since a GIF has few."""
 _FLOOR, _LINES = (0.83, 0.84, 0.85, 1.0), (0.70, 0.71, 0.73, 1.0)
@@ -29,7 +31,7 @@ _GREEN = np.array([0.1, 0.7, 0.2, 0.8], np.float32)
 class SceneCamera:
     """Camera at a fixed pose in every environment of a world.
 
-    A floor gets a grid of 0.1 m, and a scene without lamps of its own a lamp that casts shadows; nothing of it is in the model.
+    A scene without lamps of its own gets one that casts shadows, and its floor a grid of 0.1 m; nothing of it is in the model.
     Needs OpenGL without a display: MuJoCo reads the environment variable ``MUJOCO_GL`` (``egl`` or ``osmesa``) when it is imported.
     Soft pads are not drawn, since MuJoCo does not have their gel.
     """
@@ -65,6 +67,7 @@ class SceneCamera:
         self._has_lamp = world.model.nlight > 0
         light = world.model.vis.headlight
         light.ambient[:], light.diffuse[:], light.specular[:] = (0.35, 0.6, 0.1) if self._has_lamp else (0.45, 0.25, 0.0)
+        world.model.vis.quality.shadowsize = _SHADOWS
         buffer = world.model.vis.global_
         buffer.offwidth, buffer.offheight = _SHARP * width, _SHARP * height
         try:
@@ -90,8 +93,8 @@ class SceneCamera:
         self._renderer.update_scene(self.world.data[env], self._camera)
         for point in points:
             self._add(mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, _BALL), np.asarray(point, float), np.eye(3), _GREEN)
-        self._lay_floor()
         if not self._has_lamp:
+            self._lay_floor()
             self._hang_lamp()
         width, height = self.resolution
         picture = self._renderer.render().astype(np.float32)
