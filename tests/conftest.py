@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from tests import one_thread  # isort: skip  (before NumPy)
 
+import gc
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -47,6 +48,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         for mark in marks.marks_of(item.path):
             item.add_marker(mark)
+
+
+def pytest_collection_finish() -> None:
+    """Leave what stays for the whole session, some thousand tests and all modules, out of every later search for garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
