@@ -58,8 +58,8 @@ def pytest_collection_finish() -> None:
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     one_thread.limit_renderer()
-    place = item.path.relative_to(Path(__file__).parent).parts
-    case_lights.share(make_sensor_spec(), few=place[0] not in case_lights.MEASURED)
+    place = item.path.relative_to(Path(__file__).parent).as_posix()
+    case_lights.share(make_sensor_spec(), few=not place.startswith(case_lights.MEASURED))
 
 
 def make_sensor_spec() -> SensorSpec:
