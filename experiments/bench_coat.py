@@ -13,7 +13,7 @@ times ``--cell-um`` in the middle, its solver's vertices; markers are 285 points
 ``ball.<load>.<level>.markers_um``, ``markers_most_um``: mean and greatest sideways distance of a marker from the truth;
 ``mesh_markers_um`` …: the same on the solver's vertices; ``force_n``, ``contact_mm2``; with ``truth`` for a level: its own motion.
 
-``<shape>.<level>.near_um``, ``ring_um``, ``far_um``: root mean square of the shown height less the truth, on the line x = 0, within 1 mm
+``<shape>.<level>.near_um``, ``beyond_um``, ``far_um``: root mean square of the shown height less the truth, on the line x = 0, within 1 mm
 of the edge or rim, 1 to 2 mm, 2 to 4 mm; ``mesh_near_um`` …: the same of the solver's vertices joined by straight lines, which is what
 there was to see; ``force_n`` of each, and ``truth_force_n``.
 """
@@ -45,7 +45,7 @@ LOADS = {
     "shear": (StageSpec("indent", depth=0.5e-3), StageSpec("shear", shear=(0.4e-3, 0.0))),
     "twist": (StageSpec("indent", depth=0.5e-3), StageSpec("twist", twist=np.deg2rad(10.0))),
 }
-RANGES = {"near": (0.02e-3, 1e-3), "ring": (1e-3, 2e-3), "far": (2e-3, 4e-3)}
+RANGES = {"near": (0.02e-3, 1e-3), "beyond": (1e-3, 2e-3), "far": (2e-3, 4e-3)}
 _DEEPER = 0.1e-3
 """Room for a truth to be pressed deeper than the scene says [m]."""
 _GROWTH, _DOWN = 0.14, 0.25

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from tests import one_thread  # isort: skip  (before NumPy)
 
+import gc
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -49,10 +50,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(mark)
 
 
+def pytest_collection_finish() -> None:
+    """Leave what stays for the whole session, some thousand tests and all modules, out of every later search for garbage."""
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
     one_thread.limit_renderer()
-    place = item.path.relative_to(Path(__file__).parent).parts
-    case_lights.share(make_sensor_spec(), few=place[0] not in case_lights.MEASURED)
+    place = item.path.relative_to(Path(__file__).parent).as_posix()
+    case_lights.share(make_sensor_spec(), few=not place.startswith(case_lights.MEASURED))
 
 
 def make_sensor_spec() -> SensorSpec:

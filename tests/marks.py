@@ -90,7 +90,6 @@ PLACES: dict[str, tuple[str, ...]] = {
         "report/test_compare_metrics.py",
         "report/test_equal_error.py",
         "report/test_pads.py",
-        "report/test_physics_error.py",
         "report/test_press.py",
         "report/test_press_store.py",
         "report/test_preview.py",

@@ -8,7 +8,7 @@ A table stands in a page between a comment, which names a file of ``docs/measure
 
     <!-- table: compare_physics
     | scene | force [N] | height |
-    | sphere, coin = coin (relief) | {*.rigid.force_n:.2f} | {*.rigid.ring_um:.0f} µm |
+    | sphere, coin = coin (relief) | {*.rigid.force_n:.2f} | {*.rigid.beyond_um:.0f} µm |
     -->
     <!-- end -->
 

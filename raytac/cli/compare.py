@@ -46,9 +46,11 @@ class CompareArgs(SolverOptions):
     batch: int | None = None
     """Environments of the batched timing; 8 on the CPU and 64 on CUDA if not given."""
     level: Annotated[str | None, named(PADS)] = None
-    """Also press into the soft pad of this level, and report what the rigid pad misses."""
+    """With --markers: level of the soft pad, medium if not given.
+
+    raytac compare-physics compares pads."""
     markers: bool = False
-    """Also compare marker models with surface tracking on the soft pad (--level, else medium).
+    """Also compare marker models with surface tracking on the soft pad.
 
     Under normal load, shear and twist; needs a sensor with marker motion."""
     quick: bool = False

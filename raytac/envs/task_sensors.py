@@ -15,7 +15,7 @@ from raytac.physics.registry import scene_physics
 from raytac.specs.task import TaskScene
 from raytac.specs.task_file import load_task
 
-_PITCH = 0.4e-3
+NODE_PITCH = 0.4e-3
 """Spacing of the gel's nodes where no image needs a finer one [m]."""
 
 
@@ -63,8 +63,8 @@ class TaskSensors:
     def pitch(self) -> float:
         """Pitch [m] as fine as images, if any, between the coarsest allowed and 0.4 mm."""
         if "rgb" not in self.probe.settings.modalities:
-            return _PITCH
-        return max(COARSEST_PITCH, min(_PITCH, *self.probe.sensor.camera.pitch_at(self.probe.layout.rendered)))
+            return NODE_PITCH
+        return max(COARSEST_PITCH, min(NODE_PITCH, *self.probe.sensor.camera.pitch_at(self.probe.layout.rendered)))
 
     def observers(self, names: Sequence[str]) -> dict[str, TactileObserver]:
         """Observer of every sensor by name, with randomised cameras; none without touch."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from raytac.envs.flat_policy import FlatPolicy
 from raytac.envs.scripted import SCRIPTED
+from raytac.envs.task_sensors import NODE_PITCH
 from raytac.errors import InputError
 from raytac.learn.evaluation import KINDS, Outcome, ShownEpisodes
 from raytac.learn.policies import shipped_policies
@@ -20,8 +21,6 @@ __all__ = ["PolicyPlayer", "ScriptedPlayer", "find_player", "shown_beside"]
 
 _IMAGE = (160, 120)
 """Size of a film's tactile images [px]."""
-_PITCH = 0.4e-3
-"""Spacing of the gel's nodes in training [m]; a film's images would ask for a finer one."""
 
 
 def find_player(policy: str, task: str | None = None) -> PolicyPlayer | ScriptedPlayer:
@@ -71,7 +70,7 @@ class PolicyPlayer:
             options["render_mode"] = "rgb_array"
         if shown is not None and "rgb" not in self.policy.felt:  # else the images that it is given are shown
             tactile, hidden = shown_beside(self.policy.felt, shown)
-            options |= {"tactile": tactile, "hidden": hidden, "pitch": _PITCH}
+            options |= {"tactile": tactile, "hidden": hidden, "pitch": NODE_PITCH}  # as in training
         return _PolicyEpisodes(self.policy, num_envs, options)
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RIGID = "rigid"
-NEAR, RING = 1e-3, 2e-3
+NEAR, BEYOND = 1e-3, 2e-3
 """Distances from the contact [m] at which the zones of a height difference end."""
 STEP_MM = 0.05
 """A scale of height differences ends at a multiple of this."""
@@ -94,7 +94,7 @@ def pad_metrics(presses: Sequence[PadPress]) -> dict[str, Metric]:
 
     ``press_s``; ``imprint_mm`` (deepest), ``bulge_mm`` (highest above rest), ``contact_mm2``, ``force_n``. But for the finest pad also root
     mean square differences of height: ``contact_um`` (where both touch: small between soft pads, which are all laid on the object there),
-    ``near_um`` (outside the contact of either, up to 1 mm from it) and ``ring_um`` (1 to 2 mm from it); and ``image``: mean absolute
+    ``near_um`` (outside the contact of either, up to 1 mm from it) and ``beyond_um`` (1 to 2 mm from it); and ``image``: mean absolute
     difference of the images [levels of 255].
     """
     finest = {press.scene: press for press in presses}
@@ -128,8 +128,8 @@ def height_differences(one: GelSurface, other: GelSurface) -> dict[str, float]:
     """Root mean square difference of height [µm] by zone, as of ``pad_metrics``."""
     off = 1e6 * (one.height[0].astype(float) - other.height[0])
     either = one.contact[0] | other.contact[0]
-    near, ring = (widened(either, reach, one.grid.pitch) for reach in (NEAR, RING))
-    where = {"contact_um": one.contact[0] & other.contact[0], "near_um": near & ~either, "ring_um": ring & ~near}
+    near, beyond = (widened(either, reach, one.grid.pitch) for reach in (NEAR, BEYOND))
+    where = {"contact_um": one.contact[0] & other.contact[0], "near_um": near & ~either, "beyond_um": beyond & ~near}
     return {key: float(np.sqrt((off[mask] ** 2).mean())) if mask.any() else float("nan") for key, mask in where.items()}
 
 
@@ -217,7 +217,7 @@ _COLUMNS: Mapping[str, tuple[str, str]] = {
     "contact_mm2": ("contact [mm²]", ".1f"),
     "contact_um": ("height, contact [µm]", ".1f"),
     "near_um": ("height, to 1 mm [µm]", ".1f"),
-    "ring_um": ("height, 1 to 2 mm [µm]", ".1f"),
+    "beyond_um": ("height, 1 to 2 mm [µm]", ".1f"),
     "image": ("image [of 255]", ".2f"),
 }
 """Heading and number format of each figure of the report."""

@@ -14,7 +14,7 @@ def test_the_shown_coat_is_nearer_than_the_mesh(tmp_path):
     bench_coat.Args(out=tmp_path, levels="coarse", shapes="edge", cell_um=190.0).run()
     found = {key: float(value) for key, value in read_metrics(tmp_path / "metrics.json").items() if key.startswith("edge")}
     assert found["edge.coarse.near_um"] < 0.25 * found["edge.coarse.mesh_near_um"]
-    assert found["edge.coarse.ring_um"] < 0.25 * found["edge.coarse.mesh_ring_um"]
+    assert found["edge.coarse.beyond_um"] < 0.25 * found["edge.coarse.mesh_beyond_um"]
     assert found["edge.coarse.force_n"] > found["edge.truth_force_n"] > 2.0
 
 

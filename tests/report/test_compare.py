@@ -192,6 +192,14 @@ def test_a_report_is_there_after_the_first_scene_and_grows(tmp_path: Path) -> No
     assert [row.figures["scene"] for row in comparison.rows] == [name for name in settings.scenes for _ in greys.modes]
 
 
+def test_a_level_without_markers_is_refused_and_names_the_other_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*QUICK, "--level", "coarse", "--out", str(tmp_path / "out")]) == 2
+    assert "--markers" in (said := capsys.readouterr().err) and "compare-physics" in said
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_mode_that_fails_is_tried_once(tmp_path: Path) -> None:
     greys = Greys(fail={"taxim": BackendError("no table here")})
     comparison = run_comparison(replace(SETTINGS, scenes=("sphere", "coin")), tmp_path, greys.modes)

@@ -53,7 +53,7 @@ def test_the_rows_are_those_of_the_calibration(found: MarkerErrors) -> None:
 def test_metrics_and_page_hold_every_model_and_load(found: MarkerErrors, tmp_path: Path) -> None:
     pytest.importorskip("jinja2")
     settings = CompareSettings(device="cpu", markers=True)
-    comparison = Comparison(settings, "cpu", (), {}, (), 0, {"versions.raytac": "0"}, (), found)
+    comparison = Comparison(settings, "cpu", (), {}, (), 0, {"versions.raytac": "0"}, markers=found)
     metrics = compare_metrics(comparison)
     check_metrics(metrics | {"wall_s": 1.0})
     for model in MODELS:

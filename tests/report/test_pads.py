@@ -34,7 +34,7 @@ def test_a_quick_comparison_reports_both_pads(tmp_path: Path, monkeypatch: pytes
         assert metrics[f"sphere.{pad}.imprint_mm"] == pytest.approx(0.8, rel=0.02)
         assert 1.0 < metrics[f"sphere.{pad}.force_n"] < 3.0 and metrics[f"sphere.{pad}.press_s"] > 0.0
     assert metrics["sphere.coarse.bulge_mm"] > 0.005 > metrics["sphere.rigid.bulge_mm"]
-    assert metrics["sphere.rigid.contact_um"] < 5.0 < metrics["sphere.rigid.ring_um"] < 60.0
+    assert metrics["sphere.rigid.contact_um"] < 5.0 < metrics["sphere.rigid.beyond_um"] < 60.0
     assert 0.0 < metrics["sphere.rigid.image"] < 20.0 and "sphere.coarse.image" not in metrics
     page = (tmp_path / "report.html").read_text("utf-8")
     assert f"<td>{metrics['sphere.coarse.force_n']:.2f}</td>" in page and "data:image/png;base64," in page
@@ -46,7 +46,7 @@ def test_levels_against_a_finer_one() -> None:
     assert [press.pad for press in presses] == ["rigid", "coarse", "medium"]
     metrics = pads.pad_metrics(presses)
     assert float(metrics["sphere.coarse.contact_um"]) < 2.0 < float(metrics["sphere.coarse.near_um"]) < 20.0
-    assert float(metrics["sphere.coarse.ring_um"]) < 20.0 and float(metrics["sphere.medium.force_n"]) > 1.5
+    assert float(metrics["sphere.coarse.beyond_um"]) < 20.0 and float(metrics["sphere.medium.force_n"]) > 1.5
 
 
 def test_widening_reaches_as_far_as_asked() -> None:

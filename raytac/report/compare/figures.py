@@ -17,7 +17,6 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from raytac.report.compare.metrics import known, resolutions, select, summaries
-from raytac.report.compare.physics_error import PhysicsError
 from raytac.report.compare.run import Comparison
 from raytac.report.compare.store import Row
 
@@ -57,8 +56,7 @@ def write_pareto(comparison: Comparison, path: Path) -> None:
     """Error against time of a frame, log axes: frame, contact, shadow ring; a row a resolution.
 
     A point is a mode: median of times and mean of errors over the scenes, whiskers from the best scene to the worst. The hatched band is
-    the mean noise of the reference, below which no error can be resolved. With a soft pad, a star is the rigid one: the time of its press,
-    and the difference that it makes to the image by ``fast``; a line is the time of the soft press.
+    the mean noise of the reference, below which no error can be resolved.
     """
     rows, names = comparison.rows, resolutions(comparison.rows)
     looks = _looks(rows)
@@ -69,18 +67,13 @@ def write_pareto(comparison: Comparison, path: Path) -> None:
         grid = figure.subplots(len(names), len(PANELS), squeeze=False, sharex="row", sharey="row")
         for line, resolution in zip(grid, names, strict=True):
             here = select(rows, resolution=resolution)
-            pads = [error for error in comparison.physics if error.resolution == resolution]
-            _scales(line[0], here, pads)
+            _scales(line[0], here)
             for axes, (column, title) in zip(line, PANELS, strict=True):
                 _panel(axes, here, column, looks)
-                _pads(axes, pads, column)
                 axes.set_title(f"{title}, {resolution.replace('x', ' × ')}")
                 axes.set_xlabel("time of a frame, batch 1 [ms]")
             line[0].set_ylabel("MAE [levels of 255]")
         handles = [_handle(look) for look in looks.values()]
-        if comparison.physics:
-            words = f"rigid pad, against the soft one ({comparison.physics[0].pad})"
-            handles.append(Line2D([], [], color="black", marker="*", markersize=8, linestyle=":", linewidth=0.8, label=words))
         figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False, columnspacing=1.2)
         figure.savefig(path)
 
@@ -103,11 +96,9 @@ def _handle(look: Look) -> Line2D:
     return Line2D([], [], color=look.colour, label=look.words, **style)
 
 
-def _scales(axes: Axes, rows: Sequence[Row], pads: Sequence[PhysicsError]) -> None:
+def _scales(axes: Axes, rows: Sequence[Row]) -> None:
     """Log axes that hold every point of a row of panels, with room for labels."""
     times, errors = known(rows, "ms"), [v for column, _ in PANELS for v in known(rows, column) if v > 0]
-    times += [1e3 * seconds for error in pads for seconds in (error.rigid_s, error.soft_s)]
-    errors += [v for column, _ in PANELS for v in _levels(pads, column)]
     noise = [v for column, _ in PANELS for v in known(rows, f"noise_{column}") if v > 0]
     axes.set(xscale="log", yscale="log", xlim=(0.6 * min(times), 2.2 * max(times)))
     if errors:
@@ -117,22 +108,6 @@ def _scales(axes: Axes, rows: Sequence[Row], pads: Sequence[PhysicsError]) -> No
         axis.set_major_locator(LogLocator(subs=(1.0,) if math.log10(high / low) > 2.2 else (1.0, 2.0, 5.0)))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.3g}" if value < 1000 else f"{value:,.0f}"))
         axis.set_minor_formatter(NullFormatter())
-
-
-def _levels(pads: Sequence[PhysicsError], column: str) -> list[float]:
-    """Differences between the pads' images in the region of a panel [levels]."""
-    values = [float(getattr(error, column.replace("_mae", "_levels"))) for error in pads]
-    return [value for value in values if value > 0]
-
-
-def _pads(axes: Axes, pads: Sequence[PhysicsError], column: str) -> None:
-    """The rigid pad as a star and its scenes as whiskers; a line at the time of the soft press."""
-    levels = _levels(pads, column)
-    if levels:
-        rigid, soft = (1e3 * statistics.median(times) for times in ([e.rigid_s for e in pads], [e.soft_s for e in pads]))
-        axes.plot([rigid, rigid], [min(levels), max(levels)], color="black", linewidth=0.6, alpha=0.5, zorder=2)
-        axes.plot([rigid], [statistics.mean(levels)], color="black", marker="*", markersize=8, linestyle="none", zorder=3)
-        axes.axvline(soft, color="black", linestyle=":", linewidth=0.8, zorder=1)
 
 
 def _panel(axes: Axes, rows: Sequence[Row], column: str, looks: dict[str, Look]) -> None:

@@ -11,7 +11,6 @@ import numpy as np
 
 from raytac.io.metrics import Metric
 from raytac.report.compare.marker_error import marker_error_metrics
-from raytac.report.compare.physics_error import physics_metrics
 from raytac.report.compare.run import REGIONS, Comparison
 from raytac.report.compare.store import Row
 from raytac.report.image_error import METRICS
@@ -168,7 +167,6 @@ def compare_metrics(comparison: Comparison) -> dict[str, Metric]:
         "rows": len(rows),
         "rows_measured_in_this_run": comparison.measured,
         **comparison.facts,
-        **physics_metrics(comparison.physics),
         **marker_error_metrics(comparison.markers),
     }
     for summary in summaries(rows):

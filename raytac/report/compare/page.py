@@ -99,7 +99,6 @@ def report_html(comparison: Comparison, pareto: Path, sheets: list[tuple[str, st
         equal=equal_errors(rows),
         families={f["family"]: f["words"] for f in figures},
         left_out=comparison.left_out,
-        physics=comparison.physics,
         markers=comparison.markers,
         sheets=[{"scene": scene, "resolution": size.replace("x", " × "), "png": _embedded(path)} for scene, size, path in sheets],
         groups=[

@@ -28,7 +28,6 @@ from raytac.optics.trace.config import RayTraced
 from raytac.report.compare.marker_error import PAD as MARKER_PAD
 from raytac.report.compare.marker_error import MarkerErrors, marker_errors
 from raytac.report.compare.modes import Mode, Setting, chosen_modes, comparison_modes
-from raytac.report.compare.physics_error import PhysicsError, physics_errors
 from raytac.report.compare.settings import CompareSettings, expected_bake_seconds, expected_seconds
 from raytac.report.compare.store import References, Row, RowStore, Value, row_key
 from raytac.report.image_error import METRICS, has_flip, image_errors, psnr, rmse
@@ -79,8 +78,6 @@ class Comparison:
     """Rows measured in this run; the others were kept from an earlier one."""
     facts: dict[str, Metric]
     """Machine and versions."""
-    physics: tuple[PhysicsError, ...] = ()
-    """Rigid pad against the soft one, if that was asked for."""
     markers: MarkerErrors | None = None
     """Marker models against surface tracking, if that was asked for."""
     pending: tuple[str, ...] = ()
@@ -152,7 +149,6 @@ class _Run:
         self.rows: list[Row] = []
         self.images: dict[tuple[str, str], np.ndarray] = {}
         self.left_out: list[LeftOut] = []
-        self.physics: list[PhysicsError] = []
         self.measured = 0
         self.size: tuple[int, int] = (0, 0)
         """(width, height) that is measured now [px]."""
@@ -160,11 +156,9 @@ class _Run:
 
     def comparison(self, pending: tuple[str, ...] = (), markers: MarkerErrors | None = None) -> Comparison:
         """All that is measured so far."""
-        rows, left_out, physics = tuple(self.rows), tuple(self.left_out), tuple(self.physics)
+        rows, left_out = tuple(self.rows), tuple(self.left_out)
         images = dict(self.images)
-        return Comparison(
-            self.settings, self.device, rows, images, left_out, self.measured, self._facts, physics, markers, pending
-        )
+        return Comparison(self.settings, self.device, rows, images, left_out, self.measured, self._facts, markers, pending)
 
     def begin(self, size: tuple[int, int], modes: Sequence[Mode], bar: Progress) -> None:
         """Press every scene for images of ``size``, and tell how long the comparison will take."""
@@ -206,15 +200,11 @@ class _Run:
 
     def measure(self, name: str, modes: Sequence[Mode], bar: Progress) -> None:
         """Rows of one scene, by every mode."""
-        settings, size = self.settings, self._name
+        _settings, size = self.settings, self._name
         bar.set_postfix_str(f"{size} {name}: reference")
         scene = _Scene(name, self._surfaces[name], self._references, self._tracers, self.size)
         self.images[name, size] = scene.truth
         bar.update()
-        if settings.pad is not None:
-            bar.set_postfix_str(f"{size} {name}: soft pad")
-            press = next(one for one in settings.scenes if Path(one).stem == name)
-            self.physics += physics_errors(self._tracers, (press,), self.size, settings.pad, self._surfaces)
         for mode in modes:
             if mode.name not in self._failed:
                 bar.set_postfix_str(f"{size} {name}: {mode.label}")

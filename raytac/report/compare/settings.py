@@ -55,9 +55,9 @@ class CompareSettings:
     quick: bool = False
     """Fewer modes."""
     pad: str | None = None
-    """Level of the soft pad that the rigid one is measured against; None leaves those rows out."""
+    """Level of the soft pad for ``markers``; None is the one that they were fitted to."""
     markers: bool = False
-    """Also measure marker models against surface tracking, on level ``pad`` or the default."""
+    """Also measure marker models against surface tracking."""
 
     @classmethod
     def full(cls, **settings: Any) -> CompareSettings:
@@ -88,6 +88,9 @@ class CompareSettings:
                 raise InputError(name, value=value, rule=f"must be at least {lowest}")
         if self.pad is not None:
             check_known("pad", self.pad, PADS)
+            if not self.markers:
+                rule = "is the pad of --markers, which is not asked for; raytac compare-physics compares pads"
+                raise InputError("level", value=self.pad, rule=rule)
         if not self.budget_s > 0:
             raise InputError("budget_s", value=self.budget_s, rule="must be > 0 [s]")
         check_seed("seed", self.seed)
