@@ -5,7 +5,7 @@ in frame coordinates with ỹ = Rᵀ(x̃ − t): there are no fictitious forces,
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
-# pyright: reportInvalidTypeForm=false, reportOperatorIssue=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false
 
 from __future__ import annotations
 
