@@ -65,7 +65,7 @@ class Ipc:
     control: PressControl = DEFAULT_CONTROL
     """Tolerances and search of a press."""
     accuracy: SceneSettings = DEFAULT_ACCURACY
-    """Tolerances of a world; looser ones are faster (docs/measurements/soft-pad.md)."""
+    """Tolerances of a world."""
     is_simulated: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
