@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterator
 
 import pytest
 import warp as wp
 
 from raytac import warp_runtime
+
+
+@pytest.fixture(autouse=True)
+def not_started() -> Iterator[None]:
+    """Warp starts once a process; here at every call."""
+    warp_runtime.start_warp.cache_clear()
+    yield
+    warp_runtime.start_warp.cache_clear()
 
 
 def test_warp_starts_where_another_package_hides_ours(monkeypatch: pytest.MonkeyPatch) -> None:
