@@ -17,7 +17,6 @@ from raytac.physics.soft.scene_state import SceneReport
 from raytac.specs import BodySpec, MountSpec, RobotSpec, TaskScene
 from raytac.world.world import TactileWorld
 
-
 G = 9.81
 BALL = BodySpec("ball", "sphere", {"radius": 0.005}, position=(0.0, 0.0, 0.0051), mass=0.05)
 UP = TaskScene("upward", RobotSpec("fixed_sensor"), (BALL,), physics="ipc", coupling="one_way")
