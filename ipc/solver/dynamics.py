@@ -80,7 +80,7 @@ def node_gradient(
     masses: Masses,
     dt: FloatArray,
     vert_gradient: VecArray2d,
-    crowded: IntArray,
+    summed_place: IntArray,
     summed: FloatArray2d,
     R: MatArray2d,
     node_body: IntArray,
@@ -94,7 +94,7 @@ def node_gradient(
 ):
     """Adds inertia, drag and contact to the elastic gradient.
 
-    The residual is its negative on the unknowns, zero on bonded nodes. ``crowded`` (N,) is a node's place in ``summed``
+    The residual is its negative on the unknowns, zero on bonded nodes. ``summed_place`` (N,) is a node's place in ``summed``
     (:func:`sum_followers`), or −1.
     ``force_size`` is the sum of the sizes of elastic and contact force [N], which scales the rounding of energies.
     """
@@ -110,7 +110,7 @@ def node_gradient(
         if masses.inertia[k] != wp.float64(0.0):
             pull = (masses.inertia[k] * inertia_scale) * (y[env, j] - local_target[env, j])
             g += pull + (masses.drag[k] / h) * (y[env, j] - local_start[env, j])
-    contact, place = wp.vec3d(), 3 * crowded[i]
+    contact, place = wp.vec3d(), 3 * summed_place[i]
     if place >= 0:
         contact = wp.vec3d(summed[env, place], summed[env, place + 1], summed[env, place + 2])
     else:

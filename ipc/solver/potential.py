@@ -23,7 +23,7 @@ from ipc.solver.linear import SystemView, find_volume_motions, push_blocks, push
 
 _SLICE = 32
 """Rows of the matrix that lie interleaved on CUDA: as many as threads run in step."""
-_CROWD = 64
+_MANY_FOLLOWERS = 64
 """Vertices of a node from which on a block of threads sums their contact forces."""
 
 
@@ -82,10 +82,10 @@ class Potential:
         followed = {name: getattr(layout, f"vert_{name}") for name in ("body", "count", "nodes", "weight", "local")}
         followers = {f"follower{name}": getattr(layout, f"node_vert{name}") for name in ("_start", "", "_weight")}
         self.verts = filled(frames.VertexMap, device, followed | followers)
-        crowded, place = np.flatnonzero(np.diff(layout.node_vert_start) >= _CROWD), np.full(nodes, -1)
-        place[crowded] = np.arange(len(crowded))
-        self.crowded, self.crowded_place = ints(crowded), ints(place)
-        self.crowd_gradient = numbers(batch, 3 * len(crowded))
+        many, place = np.flatnonzero(np.diff(layout.node_vert_start) >= _MANY_FOLLOWERS), np.full(nodes, -1)
+        place[many] = np.arange(len(many))
+        self.summed_nodes, self.summed_place = ints(many), ints(place)
+        self.summed_gradient = numbers(batch, 3 * len(many))
 
         # State: node positions in their bodies' frames, world velocities, frames as they are, and their goals.
         self.y, self.v = vectors(nodes), vectors(nodes)
@@ -228,14 +228,14 @@ class Potential:
         inputs = [self.corner_start, self.corner, self.elements, self.el_P, active]
         self.launch(elasticity.node_elastic_gradient, self.y.shape, inputs, [self.gradient])
         self.touch(active)
-        if len(self.crowded):
+        if len(self.summed_nodes):
             threads = BLOCK if self.device.is_cuda else 1
-            inputs, outputs = [self.vert_gradient, self.verts, self.crowded, active, threads], [self.crowd_gradient]
-            dim = (self.batch, len(self.crowded), threads)
+            inputs, outputs = [self.vert_gradient, self.verts, self.summed_nodes, active, threads], [self.summed_gradient]
+            dim = (self.batch, len(self.summed_nodes), threads)
             wp.launch(dynamics.sum_followers, dim, inputs, outputs, device=self.device, block_dim=BLOCK)
         inputs = [
             *(self.y, self.local_target, self.local_start, self.masses, self.dt, self.vert_gradient),
-            *(self.crowded_place, self.crowd_gradient, self.R, self.node_body, self.node_free, self.verts, active),
+            *(self.summed_place, self.summed_gradient, self.R, self.node_body, self.node_free, self.verts, active),
         ]
         self.launch(dynamics.node_gradient, self.y.shape, inputs, [self.gradient, self.residual, self.force_size])
 
