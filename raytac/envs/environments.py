@@ -265,8 +265,8 @@ def serve_vector(pipe: Connection, kind: type[TactileVectorEnv], num_envs: int, 
 class EnvironmentPicture:
     """Pictures of a batch: the scene, and beside it what each sensor observes.
 
-    Of the modalities the image is shown, and markers with arrows of 4 times their displacement, pad frame with x to the right and y up,
-    over 4 times the image's difference from rest.
+    Of the modalities the image is shown, and markers with arrows of 4 times their displacement, turned as the image is, with x to the right
+    and y down, over 4 times the image's difference from rest.
     """
 
     def __init__(self, batch: TaskBatch, *, height: int = 240) -> None:
@@ -324,13 +324,13 @@ class EnvironmentPicture:
         draw = ImageDraw.Draw(image)
 
         def pixel(point: np.ndarray) -> tuple[float, float]:
-            return width / 2 + factor * float(point[0]), height / 2 - factor * float(point[1])
+            return width / 2 + factor * float(point[0]), height / 2 + factor * float(point[1])
 
         if seen is not None:
             (left, right), (top, bottom) = view_edges(sensor.spec)
-            low, high = pixel(np.array([left, bottom])), pixel(np.array([right, top]))  # turned over: y goes up here
+            low, high = pixel(np.array([left, top])), pixel(np.array([right, bottom]))
             span = round(high[0]) - round(low[0]), round(high[1]) - round(low[1])
-            image.paste(Image.fromarray(_resized(self._difference(name, seen)[::-1], *span)), (round(low[0]), round(low[1])))
+            image.paste(Image.fromarray(_resized(self._difference(name, seen), *span)), (round(low[0]), round(low[1])))
         for start, arrow in zip(rest, displacement, strict=True):
             x, y = pixel(start)
             draw.ellipse((x - 1, y - 1, x + 1, y + 1), fill=_DOT)
