@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -101,6 +102,21 @@ def test_a_shipped_policy_is_filmed_by_name(tmp_path: Path) -> None:
 def test_a_gif_ends_with_the_last_picture(count: int) -> None:
     shown = [int(picture) for picture in gif_pictures([np.array(k) for k in range(count)])]
     assert shown[-1] == count - 1 and shown[0] < 3 and set(np.diff(shown)) <= {3}
+
+
+def test_the_script_of_a_checkout_plays_files_of_both_trainings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By what is in the file: those of ``raytac train`` without PyTorch, which the other reader imports."""
+    from experiments import play
+
+    found = play.main(
+        play.Args(checkpoint=shipped_policies()["balance_pole_ppo"], episodes=1, num_envs=1, film=False, out=tmp_path)
+    )
+    assert (found["task"], found["policy"], found["episodes"]) == ("BalancePole", "balance_pole_ppo", 1)
+    monkeypatch.setitem(sys.modules, "experiments.ppo_learner", SimpleNamespace(CheckpointPlayer=lambda path: path))
+    theirs = Path(__file__).parents[2] / "experiments" / "policies" / "balance_pole_wrench.pt"
+    assert play.player_of(theirs) == theirs
+    with pytest.raises(InputError, match=r"is a checkpoint of train_ppo\.py.*experiments/play\.py"):
+        find_player(str(theirs))
 
 
 def test_bad_input(tmp_path: Path) -> None:
