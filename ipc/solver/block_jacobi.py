@@ -31,7 +31,7 @@ def diagonal_blocks(system: SystemView, active: IntArray, out: MatArray2d):
 
 @wp.kernel
 def diagonal_rows(system: SystemView, contacts: Contacts, spread: wp.bool, active: IntArray, lanes: wp.int32, out: MatArray2d):
-    """Adds the diagonal blocks of Σ q qᵀ.
+    """Add the diagonal blocks of Σ q qᵀ.
 
     With ``spread`` they are s sᵀ/β in rows that couple soft nodes with an affine body.
     """

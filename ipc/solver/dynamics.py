@@ -92,7 +92,7 @@ def node_gradient(
     residual: VecArray2d,
     force_size: FloatArray2d,
 ):
-    """Adds inertia, drag and contact to the elastic gradient.
+    """Add inertia, drag and contact to the elastic gradient.
 
     The residual is its negative on the unknowns, zero on bonded nodes. ``summed_place`` (N,) is a node's place in ``summed``
     (:func:`sum_followers`), or −1.
