@@ -341,12 +341,8 @@ class DeviceMode(ABC):
             raise InputError("surface.height", value=surface.height.shape, rule="must have at least one environment")
         self._check_batch(surface.batch, surface.grid)
         self.prepare(surface.grid)
-        heights = np.ascontiguousarray(surface.height, dtype=np.float32)
-        # One NaN or infinity makes the sum of squares one, and no height is so large that it does: cheaper than asking every node.
-        flat = heights.reshape(len(heights), -1)
-        failed = ~np.isfinite(np.vecdot(flat, flat))
-        # A NaN would become an index into device memory.
-        if failed.any():
+        heights, failed = np.ascontiguousarray(surface.height, dtype=np.float32), ~surface.is_finite
+        if failed.any():  # a NaN would become an index into device memory
             heights = heights.copy()
             heights[failed] = surface.grid.rest
         return heights, failed
