@@ -44,7 +44,7 @@ from ipc.solver.step_state import StepState
 _RENEWALS = 20
 """Most renewals of friction within a step's first solve, where every body is held."""
 _CALM, _CALM_RENEWALS = 4.0, 4
-"""Where a body is free: longest Newton step [ε] before a renewal, and most of these."""
+"""Longest Newton step [ε] before a renewal where a body is free, and most of these."""
 
 
 class Newton:
