@@ -202,7 +202,9 @@ def compare(args: Args, names: Sequence[str]) -> dict[str, Metric]:
     if args.envs % processes:
         raise InputError("envs", value=args.envs, rule=f"must be a multiple of the {processes} processes that share them")
     if BALL in names and processes > 1:
-        raise InputError("modes", value=args.modes, rule="must not have ball with several processes: it is one world", choices=MODES)
+        raise InputError(
+            "modes", value=args.modes, rule="must not have ball with several processes: it is one world", choices=MODES
+        )
     scenes = {f"push.{mode}": f"push:{mode}:{args.envs // processes}" for mode in names if mode != BALL}
     scenes |= {"ball_rolling.rigid": "ball:rigid"} if BALL in names else {}
     with recorded(args, "bench_rl", device="cpu", owned=("metrics.json",), packages=("gymnasium",)) as (_, metrics):

@@ -6,10 +6,10 @@
     python experiments/bench_optics.py --against ../raytac_b682ef2 --out runs/bench_optics_against
     python experiments/bench_rl.py --against ../raytac_b682ef2 --out runs/bench_rl_against
 
-Each checkout has a process of its own, or several, which wait while the other makes its step: a load that comes and goes slows both alike. Of worlds
-a turn is several steps, as a training makes them, with its memory at hand. What is compared is processor time, of all threads: those that
-wait for work count as well, so that wall time is compared too. The scenes are those of this checkout, made with what both offer; those of
-worlds are each checkout's own, with its own steps. Each process runs
+Each checkout has a process of its own, or several, which wait while the other makes its step: a load that comes and goes slows both alike.
+Of worlds a turn is several steps, as a training makes them, with its memory at hand. What is compared is processor time, of all threads:
+those that wait for work count as well, so that wall time is compared too. The scenes are those of this checkout, made with what both
+offer; those of worlds are each checkout's own, with its own steps. Each process runs
 
     PYTHONPATH=CHECKOUT python experiments/turns.py SCENE
 

@@ -17,8 +17,10 @@ _SHADOWS = 2048
 _SKY = np.array((238.0, 241.0, 245.0), np.float32)
 """Colour of the background: one, since a GIF has few."""
 _FLOOR, _LINES = (0.83, 0.84, 0.85, 1.0), (0.70, 0.71, 0.73, 1.0)
-_TILE, _REACH, _LINE, _LIFT = 0.1, 1.2, 0.8e-3, 0.2e-3
-"""Spacing of a floor's lines, their reach from the centre, half their width, and their height [m]."""
+_TILE, _REACH = 0.1, 1.2
+"""Spacing of a floor's lines, and their reach from the centre [m]."""
+_LINE, _LIFT = 0.8e-3, 0.2e-3
+"""Half the width of these lines, and their height over the floor [m]."""
 _TO_LAMP = np.array([-0.35, 0.45, 1.0])
 """Direction to the lamp; its components are to the right of the picture, to the eye, and up."""
 _LAMP = 1.6
@@ -103,7 +105,7 @@ class SceneCamera:
         return np.rint(picture.reshape(height, _SHARP, width, _SHARP, 3).mean(axis=(1, 3))).astype(np.uint8)
 
     def _add(self, kind: mujoco.mjtGeom, size: np.ndarray, at: np.ndarray, turn: np.ndarray, colour: np.ndarray) -> None:
-        """Add a geom to the picture at a position [m] and a rotation (3, 3), if MuJoCo has room for it."""
+        """Add a geom at a position [m] and a rotation (3, 3), if MuJoCo has room for it."""
         scene = self._renderer.scene
         if scene.ngeom < scene.maxgeom:
             mujoco.mjv_initGeom(scene.geoms[scene.ngeom], kind, size, at, turn.ravel(), colour)
