@@ -31,6 +31,8 @@ wp.set_module_options({"enable_backward": False})
 mat1212d = wp.types.matrix(shape=(12, 12), dtype=wp.float64)
 LANES = 256
 """Threads on CUDA for the small system of an environment; the size of all blocks."""
+_APART = 64
+"""Threads a body, of which one works: few then share a cache, since registers do not do."""
 _ENTRIES = 78
 """Of the upper half of a body's 12 × 12 matrix."""
 
@@ -268,12 +270,12 @@ def add_bodies(contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32
 
 @wp.kernel
 def factor_affine(rest: Rest, system: SystemView, active: IntArray, small: Small):
-    """L⁻¹ of every affine body.
+    """L⁻¹ of every affine body, by the first of some threads.
 
     Where its matrix is not positive definite, that of the mean diagonal of its blocks.
     """
-    env, body = wp.tid()
-    if active[env] == 0:
+    env, body, lane = wp.tid()
+    if active[env] == 0 or lane > 0:
         return
     first = 4 * body
     A = mat1212d()
@@ -521,8 +523,8 @@ class LowRank:
         """Take in affine bodies and rows, after ``find_contacts``."""
         rest, small = self.rest, self.small
         if self.bodies:
-            # In small blocks: a body is one thread's work, and its matrix has no room in registers.
-            self._launch(factor_affine, (self.batch, self.bodies), [rest, system, active, small], 32)
+            apart = _APART if self.device.is_cuda else 1
+            self._launch(factor_affine, (self.batch, self.bodies, apart), [rest, system, active, small])
         if rows:
             self._launch(add_rows, (self.batch, self.row_lanes), [contacts, rest, active, self.row_lanes, small])
             if self.bodies:
