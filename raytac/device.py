@@ -14,6 +14,7 @@ from raytac.errors import BackendError, InputError
 
 __all__ = [
     "DEVICES",
+    "cpu_cores",
     "cuda_device_count",
     "cuda_driver_version",
     "cuda_missing",
@@ -92,6 +93,11 @@ def cuda_driver_version() -> tuple[int, int]:
     if driver is None or driver.cuDriverGetVersion(ctypes.byref(version)) != 0:
         return 0, 0
     return version.value // 1000, version.value % 1000 // 10
+
+
+def cpu_cores() -> int:
+    """Number of CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @functools.cache

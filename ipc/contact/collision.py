@@ -181,11 +181,14 @@ class Collision:
             "row": contacts.mat34d,
             "row_nodes": wp.vec4i,
             "node_row": contacts.mat34d,
+            "row_body": wp.int32,
+            "body_row": contacts.mat34d,
+            "scaled_row": contacts.mat34d,
         }
         self._resize(self.contacts, fields, rows)
         room = pairs if self.friction else 1
         for lagged in (self.lagged, self._old):  # contacts, and as many that have gone
-            fields = place | {"limit": wp.float64, "slip": wp.vec3d, "turn": wp.mat33d, "swing": wp.vec3d}
+            fields = place | {"limit": wp.float64, "slip": wp.vec3d, "guard": wp.float64, "turn": wp.mat33d, "swing": wp.vec3d}
             self._resize(lagged, fields, 2 * room)
         self._resize(self.memory, {"verts": wp.vec4i, "pair": wp.int32, "slip": wp.vec3d}, room)
         self._resize(self._index, {"first": wp.int32, "next": wp.int32}, 2 * room)
@@ -379,6 +382,14 @@ class Collision:
         self._launch(friction.size_of_change, vertices, [self._change, active], [self._change_size])
         self._reduce(self._change_size, active, SUM, changed)
         self._launch(friction.share_of_change, self.batch, [self._force, active], [changed, sum_changed])
+
+    def guard_slips(self, x: wp.array, dx: wp.array, start: wp.array, active: wp.array, halt: wp.array) -> None:
+        """Choose the curvature of friction after a Newton step dx from x (B, V), in the mask (B,).
+
+        Nothing changes while ``halt`` (1,) is set.
+        """
+        inputs = [x, dx, start, active, halt, self.lanes]
+        self._launch(friction.guard_slips, (self.batch, self.lanes), inputs, [self.lagged])
 
     def undo_lag(self, active: wp.array) -> None:
         """Put back the friction from before the last :meth:`lag`, in the mask (B,)."""

@@ -42,6 +42,9 @@ from ipc.contact.contacts import Contacts, push_row
 
 wp.set_module_options({"enable_backward": False})
 
+GUARD_DECAY = wp.constant(wp.float64(0.3))
+"""Share of a pair's guard that a Newton step leaves which is shorter than its slip."""
+
 
 @wp.struct
 class Lagged:
@@ -50,7 +53,7 @@ class Lagged:
     ``fresh`` ones are from the contacts, the others such as an average with older ones kept.
 
     ``limit`` is μ λ [N], ``slip`` the part of w that the step does not change [m], ``turn`` Q over the step as it was known at the lag,
-    and ``swing`` what the gap turned by it [m].
+    and ``swing`` what the gap turned by it [m]. ``guard`` is the share of the majoriser in the curvature (:func:`guard_slips`).
     """
 
     verts: wp.array2d(dtype=wp.vec4i)
@@ -59,6 +62,7 @@ class Lagged:
     limit: FloatArray2d
     pair: IntArray2d
     slip: VecArray2d
+    guard: FloatArray2d
     turn: MatArray2d
     swing: VecArray2d
     count: IntArray
@@ -264,6 +268,7 @@ def copy_pair(pairs: Lagged, env: wp.int32, i: wp.int32, out: Lagged, k: wp.int3
     out.limit[env, k] = pairs.limit[env, i]
     out.pair[env, k] = pairs.pair[env, i]
     out.slip[env, k] = pairs.slip[env, i]
+    out.guard[env, k] = pairs.guard[env, i]
     out.turn[env, k] = pairs.turn[env, i]
     out.swing[env, k] = pairs.swing[env, i]
 
@@ -379,6 +384,7 @@ def lag_contacts(
         out.limit[env, i] = mu[pair] * contacts.force[env, i]
         out.pair[env, i] = pair
         out.slip[env, i] = slip
+        out.guard[env, i] = wp.float64(0.0)
         out.turn[env, i] = turn
         out.swing[env, i] = swing
 
@@ -460,11 +466,45 @@ def friction_rows(
         across = wp.cross(n, along)
         # Where Newton's steps are longer than the slip, the law's curvature says nothing of where they lead. The paraboloid that touches
         # the law at y lies above it everywhere (a majoriser: Hunter and Lange, A tutorial on MM algorithms, Am. Stat. 58, 2004).
-        curvature = wp.where(y < last[env], ratio, friction_curvature(y, eps))
+        share = wp.where(y < last[env], wp.float64(1.0), lagged.guard[env, i])
+        curvature = wp.max(share * ratio, friction_curvature(y, eps))
         p, q = wp.sqrt(limit * curvature), wp.sqrt(limit * ratio)
         if p > wp.float64(0.0):
             push_row(out, env, verts, (p * c[0]) * along, (p * c[1]) * along, (p * c[2]) * along, (p * c[3]) * along)
         push_row(out, env, verts, (q * c[0]) * across, (q * c[1]) * across, (q * c[2]) * across, (q * c[3]) * across)
+
+
+@wp.kernel
+def guard_slips(
+    x: VecArray2d,
+    dx: VecArray2d,
+    start: VecArray2d,
+    active: IntArray,
+    halt: IntArray,
+    lanes: wp.int32,
+    # outputs
+    lagged: Lagged,
+):
+    """Chooses the curvature of the next Newton step for pairs that the step dx from x takes far.
+
+    Beyond ε the law has no curvature along the slip: a pair whose step is longer than its slip may jump to and fro across the law's kink.
+    It has all of the majoriser's curvature in the next step, and less and less in those after, since that converges slowly. Nothing
+    happens while ``halt`` is set, since the step is then repeated.
+    """
+    env, lane = wp.tid()
+    if active[env] == 0 or halt[0] != 0:
+        return
+    for i in range(lane, wp.min(lagged.count[env], lagged.limit.shape[1]), lanes):
+        verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
+        y = wp.length(lagged.slip[env, i] + sliding(x, start, env, verts, c, n))
+        s = wp.vec3d()
+        for k in range(4):
+            if verts[k] >= 0:
+                s += c[k] * dx[env, verts[k]]
+        if wp.length(s - wp.dot(s, n) * n) > y:
+            lagged.guard[env, i] = wp.float64(1.0)
+        else:
+            lagged.guard[env, i] = GUARD_DECAY * lagged.guard[env, i]
 
 
 @wp.kernel

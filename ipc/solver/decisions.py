@@ -36,6 +36,7 @@ def start_step(friction: wp.int32, d: Decisions, f: Flags):
     d.rested[env] = 0
     d.ready[env] = 1
     d.since_lag[env] = 0
+    d.renewed[env] = 0
     d.good[env] = 0
     d.failed[env] = 0
     d.converged[env] = 0
@@ -326,13 +327,16 @@ def conclude(
     max_newton: wp.int32,
     max_relags: wp.int32,
     renewals: wp.int32,
+    calm_renewals: wp.int32,
+    calm: wp.float64,
     friction: wp.int32,
     d: Decisions,
     f: Flags,
 ):
     """End an iteration: environments converge, give up, or have their friction lagged again.
 
-    Friction is renewed within a step's first solve after each of its first ``renewals`` Newton iterations.
+    Friction is renewed within a step's first solve after each of its first ``renewals`` Newton iterations, and ``calm_renewals`` times
+    after one of at most ``calm`` [m] with all frames in place.
     """
     env = wp.tid()
     if f.halt[0] != 0:
@@ -368,6 +372,9 @@ def conclude(
     if friction != 0 and max_relags > 0 and d.plain[env] != 0 and d.active[env] != 0 and d.relags[env] == 0:
         if d.since_lag[env] <= renewals:
             d.pending[env] = 1
+        elif d.progress[env] >= wp.float64(1.0) and d.size[env] <= calm and d.renewed[env] < calm_renewals:
+            d.pending[env] = 1
+            d.renewed[env] = d.renewed[env] + 1
     # Where Newton gave up, forces are no better known after another lag; the first two may still help it on.
     if was_active != 0 and d.active[env] == 0 and friction != 0 and max_relags > 0:
         if d.converged[env] != 0 or (d.relags[env] < 2 and d.relags[env] < max_relags):

@@ -43,6 +43,8 @@ from ipc.solver.step_state import StepState
 
 _RENEWALS = 20
 """Most renewals of friction within a step's first solve, where every body is held."""
+_CALM, _CALM_RENEWALS = 4.0, 4
+"""Longest Newton step [ε] before a renewal where a body is free, and most of these."""
 
 
 class Newton:
@@ -57,7 +59,7 @@ class Newton:
         self.preconditioner = make_preconditioner(layout, settings, self.batch, lanes, self.device)
         self._still = wp.zeros_like(potential.x)
         self._friction = int(potential.collision.friction)
-        self._renewals = _RENEWALS if _is_held(layout) else 0
+        self._renewals, self._calm_renewals = (_RENEWALS, 0) if _is_held(layout) else (0, _CALM_RENEWALS)
         self._loose = max(settings.linear_tolerance, settings.forcing)
         self._graphs: dict[str, Any] = {}
         """Recordings by name of what was recorded; None for what ran once as it stands."""
@@ -248,7 +250,8 @@ class Newton:
             wp.capture_if(f.advance, self._advance)
         wp.capture_if(f.plain, self._line_search)
         tolerance = settings.velocity_tolerance
-        limits = settings.max_newton, settings.friction_relags, self._renewals
+        calm = _CALM * settings.friction_slip
+        limits = settings.max_newton, settings.friction_relags, self._renewals, self._calm_renewals, calm
         state.launch(decisions.conclude, tolerance, *limits, self._friction)
         self._set_flags()
 
@@ -285,6 +288,7 @@ class Newton:
     def _update_preconditioner(self, mask: wp.array) -> None:
         pot, contacts = self.potential, self.potential.collision.contacts
         with self._stage("preconditioner"):
+            pot.turn_rows(mask)
             self.preconditioner.update(pot.system, contacts, contacts.row.shape[1], mask)
 
     def _iterate_linear(self, mask: wp.array, tolerance: float) -> None:
@@ -350,6 +354,8 @@ class Newton:
             state.launch(decisions.start_search, pot.reach)
             wp.capture_while(state.flags.search, self._try_step)
             state.launch(decisions.end_search)
+            if self._friction and self._calm_renewals:
+                pot.collision.guard_slips(pot.x, pot.dx, pot.x_start, d.plain, state.flags.halt)
             pot.launch(dynamics.take_vectors, pot.y.shape, [pot.y1, d.accepted], [pot.y])
             pot.launch(dynamics.take_vectors, pot.x.shape, [pot.x1, d.accepted], [pot.x])
 

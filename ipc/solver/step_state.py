@@ -37,6 +37,7 @@ class Decisions:
     rested: IntArray  # its unknowns came to rest since the last advance
     ready: IntArray  # took a plain step since the last advance
     since_lag: IntArray  # iterations since friction was lagged
+    renewed: IntArray  # times that friction was renewed within the first solve, where it was calm
     keep: IntArray  # keeps the state that it has come to, also if it has not converged
     good: IntArray  # ends the step with a new state
     failed: IntArray

@@ -124,7 +124,8 @@ class DatasetArgs(SolverOptions):
             **versions(),
         }
         write_metrics(out / "metrics.json", metrics | {"wall_s": time.perf_counter() - start})
-        print(f"{plan.sweep.count} presses, {report.failed} failed (manifest.parquet says why): {out}")
+        why = " (manifest.parquet says why)" if report.failed else ""
+        print(f"{plan.sweep.count} presses, {report.failed} failed{why}: {out}")
         return print_paths(exported)
 
     def _checked_fps(self) -> float:

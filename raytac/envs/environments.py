@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from multiprocessing.connection import Connection
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Unpack
 
 import gymnasium
@@ -13,7 +12,6 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from raytac.envs.batch import StepResult, TaskBatch, TaskOptions
-from raytac.envs.processes import serve
 from raytac.envs.task_rules import Task
 from raytac.errors import InputError
 from raytac.gel.surface import chosen_envs
@@ -210,7 +208,7 @@ class TactileVectorEnv(_TaskEnv, gymnasium.vector.VectorEnv):
             observation = self._reset(waiting)
             for values in (reward, terminated, truncated, success, failed, *terms.values()):
                 values[waiting] = 0
-        infos = _infos(self.num_envs, {"reward_terms": terms, "success": success, "failed": failed})
+        infos = _infos(np.ones(self.num_envs, bool), {"reward_terms": terms, "success": success, "failed": failed})
         self._ended = terminated | truncated
         if self._mode is AutoresetMode.SAME_STEP and self._ended.any():
             ended = np.flatnonzero(self._ended)
@@ -239,7 +237,7 @@ class TactileVectorEnv(_TaskEnv, gymnasium.vector.VectorEnv):
         has_ended[ended] = True
         terms = {name: np.where(has_ended, term, 0.0) for name, term in out.terms.items()}
         final = {"reward_terms": terms, "success": out.success & has_ended, "failed": out.failed & has_ended}
-        info = _infos(self.num_envs, final)
+        info = _infos(has_ended, final)
         return {"final_obs": last, "_final_obs": has_ended, "final_info": info, "_final_info": has_ended.copy()}
 
 
@@ -250,20 +248,6 @@ def checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
     except ValueError as error:
         choices = [mode.value for mode in AutoresetMode]
         raise InputError("autoreset_mode", value=mode, rule="must be a known mode", choices=choices) from error
-
-
-def serve_vector(pipe: Connection, kind: type[TactileVectorEnv], num_envs: int, options: dict[str, Any]) -> None:
-    """Serve a vector (``raytac.envs.processes.serve``); no learner's library is imported.
-
-    The first reply holds observation and action space of one environment; commands are ``("reset", seeds)`` and ``("step", actions)``.
-    """
-
-    def make() -> tuple[Any, dict[str, Callable[[Any], Any]]]:
-        env = kind(num_envs, **options)
-        spaces = env.single_observation_space, env.single_action_space
-        return spaces, {"reset": lambda seeds: env.reset(seed=seeds), "step": env.step}
-
-    serve(pipe, make)
 
 
 class EnvironmentPicture:
@@ -383,11 +367,10 @@ def _row(observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: values[0] for name, values in observation.items()}
 
 
-def _infos(num_envs: int, values: dict[str, Any]) -> dict[str, Any]:
-    """Entries with the masks of Gymnasium's vectors: the environments that have an entry."""
+def _infos(having: np.ndarray, values: dict[str, Any]) -> dict[str, Any]:
+    """Entries with the masks of Gymnasium's vectors; ``having`` (B,): environments with one."""
     result: dict[str, Any] = {}
-    everywhere = np.ones(num_envs, bool)
     for name, value in values.items():
-        result[name] = _infos(num_envs, value) if isinstance(value, dict) else value
-        result[f"_{name}"] = everywhere.copy()
+        result[name] = _infos(having, value) if isinstance(value, dict) else value
+        result[f"_{name}"] = having.copy()
     return result

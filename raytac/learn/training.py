@@ -31,7 +31,7 @@ from raytac.io.folder import FolderLock
 from raytac.io.metrics import VERSIONED, Metric, read_metrics, versions, write_metrics
 from raytac.io.options import parse_names, parse_seeds
 from raytac.learn.evaluation import KINDS, Evaluation, Outcome, append_row, evaluate, keep_rows, segment_seed
-from raytac.learn.settings import DEVIATION_MOST, HISTORY, STEPS, PpoSettings
+from raytac.learn.settings import DEVIATION_MOST, ENTROPY, HISTORY, STEPS, PpoSettings
 from raytac.report.measure import machine
 
 _LOG = logging.getLogger("raytac")
@@ -72,7 +72,7 @@ class Training:
         self.ppo = PPO(
             actor, critic, storage,
             num_learning_epochs=args.epochs, num_mini_batches=args.minibatches, clip_param=args.clip, gamma=args.gamma,
-            lam=args.gae_lambda, entropy_coef=args.entropy, learning_rate=args.learning_rate, schedule="adaptive",
+            lam=args.gae_lambda, entropy_coef=self.settings["entropy"], learning_rate=args.learning_rate, schedule="adaptive",
             desired_kl=args.desired_kl, device=self.device,
         )  # fmt: skip
         self.ppo.train_mode()
@@ -317,4 +317,6 @@ def _settings(args: PpoSettings, touch: str, seed: int) -> dict[str, Any]:
     """Settings that a checkpoint must agree in: all but where, how long and how evaluated."""
     free = ("seeds", "touch", "steps", "minutes", "target", "processes", "threads", "episodes", "evaluate_every")
     bound = {name: value for name, value in asdict(args).items() if name not in free}
-    return bound | {"touch": touch, "seed": seed, "history": HISTORY.get(args.task, 1) if args.history is None else args.history}
+    of_task = {"history": HISTORY.get(args.task, 1), "entropy": ENTROPY.get(args.task, 0.005)}
+    chosen = {name: value if bound[name] is None else bound[name] for name, value in of_task.items()}
+    return bound | {"touch": touch, "seed": seed} | chosen

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import os
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,7 +11,7 @@ from typing import Any
 
 import drjit as dr
 
-from raytac.device import LLVM_MINIMUM, LLVM_NAMED_BY_USER, llvm_library, resolve_device
+from raytac.device import LLVM_MINIMUM, LLVM_NAMED_BY_USER, cpu_cores, llvm_library, resolve_device
 from raytac.errors import BackendError
 
 VARIANTS = {"cuda": "cuda_ad_rgb", "cpu": "llvm_ad_rgb"}
@@ -107,8 +106,7 @@ def share_cores() -> None:
     Its threads wait busily for the next image. Where physics and a policy run between two images, those threads take their cores, and
     libraries whose threads wait for each other then wait for threads that do not run.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    dr.set_thread_count(min(dr.thread_count(), max(cores // 2, 1)))
+    dr.set_thread_count(min(dr.thread_count(), max(cpu_cores() // 2, 1)))
 
 
 RENDERER = RLock()

@@ -201,8 +201,13 @@ def table_text(metrics: Mapping[str, Metric], ablations: Sequence[str]) -> str:
     return "\n".join(lines)
 
 
-def draw(real: np.ndarray, images: list[dict[str, np.ndarray]], circles: list[np.ndarray], path: Path) -> None:
-    """Draw a row a press, cut to the contact: photograph, modes, signed errors (grey is none)."""
+def draw(
+    real: np.ndarray, images: list[dict[str, np.ndarray]], circles: list[np.ndarray], path: Path, labels: Sequence[str] = ()
+) -> None:
+    """Draw a row a press, cut to the contact: photograph, modes, signed errors (grey is none).
+
+    ``labels``: text at the left of each row.
+    """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle
@@ -229,4 +234,6 @@ def draw(real: np.ndarray, images: list[dict[str, np.ndarray]], circles: list[np
             line[0].add_patch(circle)
         for axis, name in zip(axes[0], columns, strict=True):
             axis.set_title(name)
+        for axis, label in zip(axes[:, 0], labels, strict=False):
+            axis.set_ylabel(label)
         figure.savefig(path, dpi=110)

@@ -143,6 +143,10 @@ class TactileSensor:
         self._has_warned = False
         """True once this press was warned of as too narrow for the pad's cells."""
 
+    def __repr__(self) -> str:
+        size, outputs = "{} x {} px".format(*self.resolution), ", ".join(self.outputs)
+        return f"TactileSensor({self.spec.name}, {size}, {self.label}; outputs: {outputs}; environments: {self.num_envs})"
+
     def _repr_html_(self) -> str:
         """Card for notebooks; with the image at rest once a renderer is built."""
         from raytac.io.html import card, picture
