@@ -181,6 +181,9 @@ class Collision:
             "row": contacts.mat34d,
             "row_nodes": wp.vec4i,
             "node_row": contacts.mat34d,
+            "row_body": wp.int32,
+            "body_row": contacts.mat34d,
+            "scaled_row": contacts.mat34d,
         }
         self._resize(self.contacts, fields, rows)
         room = pairs if self.friction else 1

@@ -19,7 +19,7 @@ from ipc.contact.collision import Collision
 from ipc.reduce import BLOCK, MAX, MIN, SUM, Reducer
 from ipc.settings import Settings
 from ipc.solver import dilation, dynamics, elasticity, frames
-from ipc.solver.linear import SystemView, find_volume_motions, push_blocks, push_rows, slice_rows
+from ipc.solver.linear import SystemView, find_volume_motions, push_blocks, push_rows, slice_rows, turn_rows
 
 _SLICE = 32
 """Rows of the matrix that lie interleaved on CUDA: as many as threads run in step."""
@@ -256,6 +256,11 @@ class Potential:
         if self.volume_blocks:
             inputs, row = [self.elements, self.volumes, self.el_F, active], self.system.volume_row
             self.launch(dilation.dilation_rows, row.shape, inputs, [row])
+
+    def turn_rows(self, active: wp.array) -> None:
+        """Write the contact rows of :meth:`touch` over the unknowns."""
+        lanes = self.collision.lanes
+        self.launch(turn_rows, (self.batch, lanes), [self.system, self.collision.contacts, active, lanes])
 
     def try_step(self, alpha: wp.array) -> None:
         """y1 = y + alpha p and its vertices, in the frames as they are."""
