@@ -271,7 +271,8 @@ class TactileObserver:
             images = images[:, y : y + height * k, x : x + width * k]
         elif layout.crop is None or size != layout.crop[2:]:
             expected = "x".join(str(n) for n in layout.rendered)
-            raise InputError("frame.rgb", value=size, rule=f"must be {expected}, or a crop as in sensor_options")
+            how = "give its sensor or world **observer.sensor_options()"
+            raise InputError("frame.rgb", value=size, rule=f"must be {expected}, or the crop that is observed: {how}")
         if k > 1:
             blocks = images.reshape(len(images), height, k, width, k, 3)
             images = (blocks.sum(axis=(2, 4), dtype=np.uint32) + k * k // 2) // (k * k)
