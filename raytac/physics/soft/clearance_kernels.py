@@ -124,7 +124,10 @@ def gaps_in_rows(
     # outputs
     sums: wp.array2d(dtype=wp.vec3d),
 ):  # fmt: skip
-    """By (environment, row): sums of pressure × gap and pressure over nodes that touch, and greatest overlap with the coat at rest."""
+    """Sums of pressure × gap and pressure over a row's nodes that touch, and greatest overlap.
+
+    By (environment, row); the overlap is of object and resting coat [m].
+    """
     env, row = wp.tid()
     total, weight, overlap = wp.float64(0.0), wp.float64(0.0), -infinity()
     highest = lowest[env] + _CUT

@@ -60,9 +60,9 @@ def pressed(grid: PadGrid, parts: list[Part], surround: ElasticSurround | None) 
 def ball_presses(
     gelpad: GelpadSpec, grid: PadGrid, camera: Pinhole, settings: BakeSettings, seed: int, *, bare: bool = False
 ) -> Iterator[GelSurface]:
-    """Surfaces of one environment, each with up to ``settings.balls`` balls; ``bare``: those without surround.
+    """Surfaces of one environment with up to ``settings.balls`` balls each.
 
-    Both kinds together are ``settings.images``. Radii are spread evenly in their logarithm, depths below the resting surface under the
+    ``bare``: those without surround. Both kinds together are ``settings.images``. Radii are spread evenly in their logarithm, depths below the resting surface under the
     ball's centre evenly; a ball is never pressed beyond its equator, and its contact lies wholly in view.
     """
     points = even_sequence(4, np.random.default_rng([seed, 3] if bare else seed).uniform(size=4))
@@ -73,7 +73,7 @@ def ball_presses(
 
 
 def punch_presses(gelpad: GelpadSpec, grid: PadGrid, camera: Pinhole, settings: BakeSettings, seed: int) -> Iterator[GelSurface]:
-    """``settings.punches`` surfaces of one environment, each with up to ``settings.balls`` flat-ended pins.
+    """``settings.punches`` surfaces with up to ``settings.balls`` flat-ended pins each.
 
     Of all gel that no object touches, that at a pin is steepest. Places, radii and depths are spread as those of balls.
     """
