@@ -16,10 +16,10 @@ def gif_bytes(pictures: Sequence[np.ndarray], rate: float) -> bytes:
     """A GIF that repeats, of 8-bit pictures (H, W, 3) of one size, ``rate`` a second."""
     from PIL import Image
 
-    # One palette for all, so that what stands still does not flicker.
+    # One palette for all, so that what stands still does not flicker. Dithering would put grain on the smooth images of sensors.
     sample = np.concatenate([picture[::4, ::4] for picture in pictures[:: max(1, len(pictures) // 12)]])
-    palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MEDIANCUT)
-    images = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for picture in pictures]
+    palette = Image.fromarray(sample).quantize(255, method=Image.Quantize.MEDIANCUT, kmeans=3)
+    images = [Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     stream = io.BytesIO()
     images[0].save(stream, "GIF", save_all=True, append_images=images[1:], duration=round(1e3 / rate), loop=0)
     return stream.getvalue()

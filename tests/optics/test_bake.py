@@ -66,6 +66,18 @@ def test_a_ball_looks_as_the_ray_tracer_shows_it(baked: Baked, calibration: Cali
     assert error.uncovered == 0
 
 
+def test_a_touch_of_a_micrometre_hardly_changes_the_image(baked: Baked, calibration: Calibration) -> None:
+    """As the image at rest is exact, one that jumped at first touch would show contact where the ray tracer sees none."""
+    rest = calibration.rest_image.astype(int)
+    mode = Taxim(calibration=baked.table, shadows=False).build(MINI, resolution=SIZE, device="cpu")
+    change = []
+    for depth in (1e-6, 5e-6, 0.1e-3):
+        image = mode.render(ball(calibration, 4e-3, depth)).rgb
+        assert image is not None
+        change.append(np.abs(image[0].astype(int) - rest).max())
+    assert change[0] <= 1 and change[0] <= change[1] < 0.5 * change[2]
+
+
 def test_touched_gel_and_that_around_have_sheets_of_their_own() -> None:
     """Near lights see slopes of the deep contact and of the skirt beside it unlike: one sheet takes the mean of both."""
     at = Calibration(load_sensor("gelsight_mini"), device="cpu", resolution=SIZE)

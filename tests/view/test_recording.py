@@ -167,3 +167,11 @@ def test_films_have_one_size_and_gifs_one_palette():
     assert film.info["duration"] == 100
     sheet = film_picture(states(1)[0], PICTURES[0], arrows=False, heights=HeightScale())
     assert sheet.dtype == np.uint8 and sheet.shape[0] % 2 == 0 and sheet.shape[1] % 2 == 0
+
+
+def test_a_gif_puts_no_grain_on_a_smooth_image() -> None:
+    row = np.linspace(30, 190, 320)
+    smooth = np.stack([np.tile(row, (240, 1)), np.tile(row[::-1], (240, 1)), np.full((240, 320), 90.0)], axis=-1).astype(np.uint8)
+    shown = np.asarray(Image.open(io.BytesIO(gif_bytes([smooth, smooth], 10.0))).convert("RGB")).astype(int)
+    assert np.abs(shown - smooth).max() <= 3
+    assert (np.diff(shown[..., 0], axis=1) >= 0).all()  # as the image itself; dithering goes to and fro

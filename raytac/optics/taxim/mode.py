@@ -29,6 +29,8 @@ from raytac.specs.sensor import SensorSpec
 _ASPECT_TOLERANCE = 0.01
 _UNCOVERED = 2
 """Flag of a pixel in contact whose bin no calibration sample reached."""
+FULL_DISPLACEMENT = 20e-6
+"""Displacement [m] up to which the change from the image at rest grows in proportion."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class TableShader:
     def __init__(self, mi: Any, table: PolyTable, resolution: tuple[int, int], pitch: float, *, shadow: bool) -> None:
         """``resolution`` [px] may differ from the table's; ``pitch`` of an image pixel along x [m]."""
         self.mi, self.table, self.resolution = mi, table, resolution
+        self.pitch = pitch
         self.scale = (table.resolution[0] / resolution[0], table.resolution[1] / resolution[1])
         """Calibration pixels per image pixel along x and y."""
         background = resized(table.background, resolution)
@@ -96,7 +99,9 @@ class TableShader:
             looked_up = ~still if contact is None else ~still | (contact != 0)
             # A branch: packets are dear, and most pads are at rest in most places.
             *change, covered = dr.if_stmt((), looked_up, binned, lambda: (mi.Float(0),) * 4, label="bins")
-            change = [dr.select(still, 0, d) for d in change]
+            # A table says nothing of a touch so light: its flat bins are the apex and the far skirt of deep presses.
+            share = dr.minimum(1, dr.abs(here) * (self.pitch / FULL_DISPLACEMENT))
+            change = [dr.select(still, 0, share * d) for d in change]
         else:
             *change, covered = binned()
         flags = mi.UInt8(0)

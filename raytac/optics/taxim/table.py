@@ -137,7 +137,8 @@ class PolyTable:
     """Field whose slopes are the index, one of ``SLOPES_OF``.
 
     ``"displacement"``: slopes of rest − z, and dI = 0 where a pixel and its four neighbours have not moved, so that the image at rest is
-    the background exactly, also on a dome. ``"height"``: slopes of −z (upstream)."""
+    the background exactly, also on a dome; where it moved by less than 20 µm, dI is that share of the polynomial's. ``"height"``: slopes of
+    −z (upstream)."""
     rest_image: np.ndarray | None = None
     """Image at rest as taken, (H, W, 3), uint8, for ``save_calibration``; None: the background."""
     gel_map: np.ndarray | None = None

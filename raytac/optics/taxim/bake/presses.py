@@ -62,8 +62,8 @@ def ball_presses(
 ) -> Iterator[GelSurface]:
     """Surfaces of one environment with up to ``settings.balls`` balls each.
 
-    ``bare``: those without surround. Both kinds together are ``settings.images``. Radii are spread evenly in their logarithm, depths below the resting surface under the
-    ball's centre evenly; a ball is never pressed beyond its equator, and its contact lies wholly in view.
+    ``bare``: those without surround. Both kinds together are ``settings.images``. Radii are spread evenly in their logarithm, depths below
+    the resting surface under the ball's centre evenly; a ball is never pressed beyond its equator, and its contact lies wholly in view.
     """
     points = even_sequence(4, np.random.default_rng([seed, 3] if bare else seed).uniform(size=4))
     caps = round(settings.images * settings.bare_share)
