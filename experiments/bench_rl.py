@@ -107,6 +107,8 @@ class Args(CommonOptions):
     """Checkout of another commit to take turns with."""
     rounds: int = 3
     """Of turns, beside the first, which compiles and is not counted."""
+    processes: int = 1
+    """With ``--against``: processes of each checkout, which share the environments and step at the same time."""
 
 
 def main(args: Args) -> dict[str, Metric]:
@@ -196,10 +198,18 @@ def compare(args: Args, names: Sequence[str]) -> dict[str, Metric]:
     if args.device == "cuda":
         raise InputError("device", value=args.device, rule="must be the CPU with --against", choices=("auto", "cpu"))
     check_whole("rounds", args.rounds)
-    scenes = {f"push.{mode}": f"push:{mode}:{args.envs}" for mode in names if mode != BALL}
+    processes = check_whole("processes", args.processes)
+    if args.envs % processes:
+        raise InputError("envs", value=args.envs, rule=f"must be a multiple of the {processes} processes that share them")
+    if BALL in names and processes > 1:
+        raise InputError(
+            "modes", value=args.modes, rule="must not have ball with several processes: it is one world", choices=MODES
+        )
+    scenes = {f"push.{mode}": f"push:{mode}:{args.envs // processes}" for mode in names if mode != BALL}
     scenes |= {"ball_rolling.rigid": "ball:rigid"} if BALL in names else {}
     with recorded(args, "bench_rl", device="cpu", owned=("metrics.json",), packages=("gymnasium",)) as (_, metrics):
-        metrics |= {"envs": args.envs, "rounds": args.rounds, **machine(), **in_turn(args.against, scenes, args.rounds + 1)}
+        metrics |= {"envs": args.envs, "processes": processes, "rounds": args.rounds, **machine()}
+        metrics |= in_turn(args.against, scenes, args.rounds + 1, processes)
     return metrics
 
 

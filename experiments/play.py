@@ -1,9 +1,11 @@
-"""Watch a checkpoint of ``train_ppo.py``, as ``raytac play`` does a policy of ``raytac train``: a film and a success rate.
+"""Watch a policy, as ``raytac play`` does: a film and a success rate. Either of ``train_ppo.py`` or of ``raytac train``.
 
     python experiments/play.py experiments/policies/balance_pole_wrench.pt
     python experiments/play.py experiments/policies/push_cube_markers.pt --physics ipc --episodes 4 --no-film
+    python experiments/play.py runs/train/PushCube/wrench/seed0/checkpoint.pt
 
-Its network is one of stable-baselines3, so it needs raytac[rl]. Files, options and seeds are those of ``raytac play``.
+A checkpoint of ``train_ppo.py`` is a network of stable-baselines3, and needs raytac[rl]. One of ``raytac train`` is of rsl_rl, and
+needs no PyTorch. Files, options and seeds are those of ``raytac play``.
 """
 
 from __future__ import annotations
@@ -11,11 +13,15 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from experiments.running import run
 from raytac.io import CommonOptions, Metric
+
+if TYPE_CHECKING:
+    from raytac.learn import Player
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +29,7 @@ class Args(CommonOptions):
     """Play a checkpoint; ``seed`` is the number of the film's episode among the held-out ones."""
 
     checkpoint: tyro.conf.Positional[Path]
-    """A file that ``train_ppo.py`` has written."""
+    """A file .pt that ``train_ppo.py`` or ``raytac train`` has written."""
     physics: str | None = None
     """Pads that it is played on: ``rigid`` or ``ipc``, those that it was trained on if not given."""
     episodes: int = 100
@@ -38,13 +44,24 @@ class Args(CommonOptions):
     """Optical mode of the sensors' images in the film, where the policy is not given images itself."""
 
 
+def player_of(path: Path) -> Player:
+    """Player of a checkpoint of either training; the file says which. Raises ``InputError`` for a file that is none."""
+    from raytac.envs import FlatPolicy
+    from raytac.learn import PolicyPlayer
+
+    if FlatPolicy.is_one(path):
+        return PolicyPlayer(path)
+    from experiments.ppo_learner import CheckpointPlayer
+
+    return CheckpointPlayer(path)
+
+
 def main(args: Args) -> dict[str, Metric]:
     """Play it and write the film, the strip and the metrics."""
     os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported, which is below
-    from experiments.ppo_learner import CheckpointPlayer
     from raytac.learn import play_policy
 
-    player = CheckpointPlayer(args.checkpoint)
+    player = player_of(args.checkpoint)
     out = args.folder("play", player.name)
     metrics = play_policy(
         player, out, episodes=args.episodes, num_envs=args.num_envs, physics=args.physics, film=args.film, mp4=args.mp4,

@@ -20,7 +20,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, NatureC
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecFrameStack, VecMonitor, VecNormalize
 
 from raytac.checks import check_known, check_number, check_numbers, check_seed, check_whole
-from raytac.envs import ProcessVecEnv, TactileVecEnv, TactileVectorEnv
+from raytac.envs import ProcessVectorEnv, TactileVecEnv, TactileVectorEnv
 from raytac.errors import InputError
 from raytac.io import write_atomic
 from raytac.learn import KINDS, Evaluation, Outcome, evaluate, shown_beside
@@ -235,9 +235,8 @@ class Learner:
         tactile = tactile_settings(recipe.tactile, recipe.resolution)
         options: dict[str, Any] = {"tactile": tactile, "device": recipe.device, "physics": recipe.physics, **overrides}
         kind, count = KINDS[recipe.task], recipe.num_envs
-        self.base: TactileVecEnv | ProcessVecEnv
         if recipe.processes > 1:
-            self.base = ProcessVecEnv(kind, num_envs=count, processes=recipe.processes, seed=recipe.seed, **options)
+            self.base = TactileVecEnv(ProcessVectorEnv(kind, count, processes=recipe.processes, seed=recipe.seed, **options))
         else:
             self.base = TactileVecEnv(kind(count, seed=recipe.seed, **options))
         seen: VecEnv = _Without(self.base, hidden) if hidden else self.base

@@ -6,10 +6,10 @@
     python experiments/bench_optics.py --against ../raytac_b682ef2 --out runs/bench_optics_against
     python experiments/bench_rl.py --against ../raytac_b682ef2 --out runs/bench_rl_against
 
-Each checkout has a process of its own, which waits while the other makes its step: a load that comes and goes slows both alike. Of worlds
-a turn is several steps, as a training makes them, with its memory at hand. What is compared is processor time, of all threads: those that
-wait for work count as well, so that wall time is compared too. The scenes are those of this checkout, made with what both offer; those of
-worlds are each checkout's own, with its own steps. Each process runs
+Each checkout has a process of its own, or several, which wait while the other makes its step: a load that comes and goes slows both alike.
+Of worlds a turn is several steps, as a training makes them, with its memory at hand. What is compared is processor time, of all threads:
+those that wait for work count as well, so that wall time is compared too. The scenes are those of this checkout, made with what both
+offer; those of worlds are each checkout's own, with its own steps. Each process runs
 
     PYTHONPATH=CHECKOUT python experiments/turns.py SCENE
 
@@ -38,52 +38,65 @@ TOGETHER = {"push": 20, "ball": 20}
 
 
 class Turn:
-    """A checkout's process."""
+    """A checkout's processes, which step at the same time."""
 
-    def __init__(self, checkout: Path, scene: str) -> None:
+    def __init__(self, checkout: Path, scene: str, processes: int) -> None:
         threads = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
-        self._process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).resolve()), scene],
-            cwd=checkout,
-            env={**os.environ, **threads, "PYTHONPATH": str(checkout)},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        self._processes = [
+            subprocess.Popen(
+                [sys.executable, str(Path(__file__).resolve()), scene],
+                cwd=checkout,
+                env={**os.environ, **threads, "PYTHONPATH": str(checkout)},
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+            for _ in range(processes)
+        ]
 
     def step(self) -> tuple[float, float]:
-        """Processor and wall time of the next step [s]; NaN for one that is not counted.
+        """Processor time of the next step, of all processes, and wall time of the slowest [s].
 
-        Raises ``ChildProcessError``: the process ended, with its last line.
+        NaN for a step that is not counted. Raises ``ChildProcessError``: a process ended, with its last line.
         """
-        assert self._process.stdin is not None and self._process.stdout is not None and self._process.stderr is not None
-        try:
-            self._process.stdin.write("\n")
-            self._process.stdin.flush()
-        except BrokenPipeError:
-            pass
-        for line in self._process.stdout:
+        for process in self._processes:
+            assert process.stdin is not None
+            try:
+                process.stdin.write("\n")
+                process.stdin.flush()
+            except BrokenPipeError:
+                pass
+        processor, wall = zip(*map(self._seconds, self._processes), strict=True)
+        return sum(processor), max(wall)
+
+    @staticmethod
+    def _seconds(process: subprocess.Popen[str]) -> tuple[float, float]:
+        assert process.stdout is not None and process.stderr is not None
+        for line in process.stdout:
             if line.startswith("seconds "):
                 processor, wall = line.split()[1:]
                 return float(processor), float(wall)
-        last = (self._process.stderr.read().strip() or "no message").splitlines()[-1]
-        raise ChildProcessError(f"the step process ended with {self._process.wait()}: {last}")
+        last = (process.stderr.read().strip() or "no message").splitlines()[-1]
+        raise ChildProcessError(f"the step process ended with {process.wait()}: {last}")
 
     def end(self) -> None:
-        self._process.kill()
-        self._process.communicate()
+        for process in self._processes:
+            process.kill()
+            process.communicate()
 
 
-def speedup(ours: Path, theirs: Path, scene: str, rounds: int = ROUNDS) -> dict[str, float]:
+def speedup(ours: Path, theirs: Path, scene: str, rounds: int = ROUNDS, processes: int = 1) -> dict[str, float]:
     """Times of a scene's steps, a turn each, and how many times this checkout is faster.
+
+    ``processes``: of each checkout, which make the scene at the same time.
 
     Returns:
         ``ms``, ``their_ms``: medians over the counted steps.    ``speedup``: ratio of the two.    ``least``, ``most``: of single rounds.
         ``wall_speedup``: of wall times.
     """
     steps = steps_of(scene)
-    turns = [Turn(ours, scene), Turn(theirs, scene)]
+    turns = [Turn(checkout, scene, processes) for checkout in (ours, theirs)]
     times = np.empty((rounds, steps, 2, 2))
     try:
         for k in range(rounds * steps):
@@ -106,8 +119,10 @@ def speedup(ours: Path, theirs: Path, scene: str, rounds: int = ROUNDS) -> dict[
     }
 
 
-def in_turn(against: Path, scenes: dict[str, str], rounds: int = ROUNDS) -> dict[str, str | int | float | bool]:
-    """Metrics of scenes by their keys; prints a line for each. ``rounds``: as of ``speedup``.
+def in_turn(
+    against: Path, scenes: dict[str, str], rounds: int = ROUNDS, processes: int = 1
+) -> dict[str, str | int | float | bool]:
+    """Metrics of scenes by their keys; prints a line for each. ``rounds``, ``processes``: as of ``speedup``.
 
     Raises ``InputError``: no checkout of this project.
     """
@@ -120,7 +135,7 @@ def in_turn(against: Path, scenes: dict[str, str], rounds: int = ROUNDS) -> dict
     metrics: dict[str, str | int | float | bool] = {"against": name, "commit": commit(ours)}
     for key, scene in scenes.items():
         try:
-            values = speedup(ours, theirs, scene, rounds)
+            values = speedup(ours, theirs, scene, rounds, processes)
         except ChildProcessError as error:
             raise RaytacError(f"{scene}: {error}") from error
         metrics |= {f"{key}.processor_ms_per_step": values["ms"], f"{key}.processor_ms_per_step_{name}": values["their_ms"]}

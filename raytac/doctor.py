@@ -1,4 +1,4 @@
-"""``raytac doctor``: try what the jobs need, and say what will be used and how to mend it.
+"""``raytac doctor``: try what the jobs need, and say what will be used and how to fix it.
 
 Each trial is a process of its own. A library that aborts (LLVM 15 does, inside Dr.Jit, on some machines) takes its process down
 before Python can say a word; here it takes down only its probe.
@@ -126,7 +126,7 @@ class Probe:
     required: bool
     """True if the default job cannot run without it."""
     fix: str
-    """Advice that mends it."""
+    """Advice that fixes it."""
     skip: Callable[[], str] = field(default=lambda: "")
     """Why there is nothing to try, or an empty text."""
 
@@ -168,10 +168,10 @@ class Report:
             mark = "ok     " if check.ok else "MISSING" if check.required else "absent "
             lines.append(f"{mark}  {check.name:<16} {check.detail}")
             if check.fix:
-                lines.append(f"{'':9}{'':<16} mend: {check.fix}")
+                lines.append(f"{'':9}{'':<16} fix: {check.fix}")
         verdict = f"The default job will run on: {self.device}" if self.ok else "The default job cannot run; see MISSING above."
         if self.device == "none":
-            verdict = "The default job cannot run: neither mitsuba-cuda nor mitsuba-llvm works; mending one is enough."
+            verdict = "The default job cannot run: neither mitsuba-cuda nor mitsuba-llvm works; fixing one is enough."
         return "\n".join([*lines, "", verdict])
 
 

@@ -48,7 +48,7 @@ class AssetError(RaytacError, FileNotFoundError):
 
 
 class BackendError(RaytacError, RuntimeError):
-    """A renderer, solver or device is missing or does not work; the message says how to mend it."""
+    """A renderer, solver or device is missing or does not work; the message says how to fix it."""
 
 
 class InputError(RaytacError, ValueError):

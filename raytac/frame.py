@@ -193,6 +193,8 @@ class TactileFrame:
             drawn = axes.imshow(image, **settings)
             axes.set_title(caption, fontsize=9)
             axes.tick_params(labelsize=7)
+            axes.set_xlabel("x [mm]" if "extent" in settings else "x [px]", fontsize=7)
+            axes.set_ylabel("y [mm]" if "extent" in settings else "y [px]", fontsize=7)
             if image.ndim == 2:
                 figure.colorbar(drawn, ax=axes, shrink=0.8).ax.tick_params(labelsize=7)
             if caption == "image" and "markers" in self.outputs:

@@ -55,6 +55,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "test_shipped_sensors.py",
         "test_show.py",
         "view/test_view_command.py",
+        "world/test_scene_camera.py",
     ),
     "solver": (
         "dataset",

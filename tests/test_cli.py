@@ -15,6 +15,7 @@ import trimesh
 import raytac
 from raytac.cli import COMMANDS, main
 from raytac.io.metrics import read_metrics
+from raytac.specs import load_sensor
 
 TOUCH = """
 [object]
@@ -125,7 +126,28 @@ def test_the_overview_is_one_line_a_command_and_fits_a_screen(capsys: pytest.Cap
 def test_every_command_has_its_own_help(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main([name, "--help"])
-    assert ended.value.code == 0 and f"usage: raytac {name} " in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert ended.value.code == 0 and f"usage: raytac {name} " in told and "{None}" not in told
+
+
+@pytest.mark.parametrize(
+    ("option", "given", "rule"),
+    [("--depth", "0.8mm", "must be a number, not '0.8mm'"), ("--spp", "2.5", "must be a whole number, not '2.5'")],
+)
+def test_an_option_that_may_be_left_out_names_what_it_takes(
+    option: str, given: str, rule: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["press", "coin", option, given])
+    assert ended.value.code == 2 and f"Error parsing {option}: {rule}" in capsys.readouterr().err
+
+
+def test_the_spacing_of_the_height_map_is_chosen(tmp_path: Path) -> None:
+    command = ["press", "sphere", "--outputs", "height", "--pitch", "0.4", "--out", str(tmp_path / "out")]
+    assert main(command) == 0
+    size = load_sensor("gelsight_mini").gelpad.size  # (x, y); rows along y
+    rows, columns = np.load(tmp_path / "out" / "height.npy").shape
+    assert abs((rows - 1) * 0.4e-3 - size[1]) < 0.4e-3 and abs((columns - 1) * 0.4e-3 - size[0]) < 0.4e-3
 
 
 def test_messages_of_the_library_are_lines_on_standard_error(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -170,13 +192,13 @@ def shell(command: str, cwd: Path, **env: str) -> subprocess.CompletedProcess[by
 
 def test_output_that_nobody_reads_ends_quietly(tmp_path: Path) -> None:
     ended = shell("{press} out | true; echo ${PIPESTATUS[0]}", tmp_path)
-    assert ended.stdout == b"141\n" and ended.stderr == b""
+    assert ended.stdout == b"141\n" and ended.stderr.startswith(b"raytac: indentation") and ended.stderr.count(b"\n") == 1
     assert (tmp_path / "out" / "metrics.json").is_file()
 
 
 def test_output_to_a_full_device_is_one_line(tmp_path: Path) -> None:
     ended = shell("{press} out > /dev/full", tmp_path)
-    assert ended.returncode == 2 and ended.stderr.count(b"\n") == 1 and b"No space left" in ended.stderr
+    assert ended.returncode == 2 and ended.stderr.count(b"\n") == 2 and b"No space left" in ended.stderr.splitlines()[1]
 
 
 def test_a_disk_that_takes_no_more_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
@@ -208,6 +230,6 @@ def test_paths_that_are_not_utf_8_are_written(tmp_path: Path, locale: dict[str, 
     ]
     env = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])} | locale
     ended = subprocess.run(args, env=env, capture_output=True, check=False)
-    assert ended.returncode == 0 and ended.stderr == b"", ended.stderr
+    assert ended.returncode == 0 and ended.stderr.count(b"\n") == 1, ended.stderr
     assert {path.name for path in folder.iterdir()} == {"rgb.png", "frame.exr", "height.npy", "preview.png", "metrics.json"}
     assert read_metrics(folder / "metrics.json")["scene"] == "sc\\udce8ne"

@@ -93,7 +93,7 @@ def test_a_broken_llvm_leaves_the_gpu_and_the_other_way_round() -> None:
     assert diagnose([probe("mitsuba-cuda", broken, False), probe("mitsuba-llvm")]).device == "cpu"
     neither = diagnose([probe("mitsuba-cuda", broken, False), probe("mitsuba-llvm", broken, False)])
     assert (neither.device, neither.exit_code) == ("none", 1)
-    assert "mending one is enough" in neither.to_text()
+    assert "fixing one is enough" in neither.to_text()
 
 
 @pytest.mark.parametrize(("required", "code"), [(True, 1), (False, 0)])
@@ -101,7 +101,7 @@ def test_exit_code_is_1_only_if_the_default_job_cannot_run(required: bool, code:
     checks = (Check("mitsuba-llvm", True, False, "", ""), Check("x", False, required, "gone", "mend x"))
     report = Report("cpu", checks, {})
     assert report.exit_code == code
-    assert "mend: mend x" in report.to_text()
+    assert "fix: mend x" in report.to_text()
 
 
 @pytest.mark.parametrize("abort", [False, True])

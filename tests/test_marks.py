@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 import re
 import subprocess
 import sys
@@ -25,6 +26,17 @@ def test_every_place_exists(mark: str, place: str) -> None:
 
 def test_a_place_is_no_part_of_a_name() -> None:
     assert marks.marks_of(TESTS / "optics_of_others" / "test_x.py") == [] == marks.marks_of(Path("/elsewhere/optics/test_x.py"))
+
+
+def test_no_plugin_of_pytest_imports_numpy_before_its_threads_are_limited() -> None:
+    """Else a test in one process waits busily: fits by small matrices take several times their time. See addopts of pyproject.toml."""
+    code = "import sys, pytest; pytest.main(['--collect-only', '-q', 'tests/test_words.py']); from tests import one_thread as o; "
+    environment = {
+        name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS") and "PYTEST" not in name
+    }
+    command = [sys.executable, "-c", code + "sys.exit('NumPy came first' if o.NUMPY_WAS_FIRST else 0)"]
+    done = subprocess.run(command, cwd=TESTS.parent, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(

@@ -109,6 +109,7 @@ def test_cards_escape_what_they_are_given(tmp_path: Path) -> None:
 
 def test_a_sensor_shows_its_image_at_rest_once_it_has_a_renderer(sensor: raytac.TactileSensor, frame: TactileFrame) -> None:
     new = copy.copy(raytac.TactileSensor("gelsight_mini"))
+    assert repr(new) == "TactileSensor(gelsight_mini, 320 x 240 px, rigid+raytrace-fast; outputs: rgb; environments: 1)"
     page = new._repr_html_()
     assert not pictures(page) and "320 × 240 px" in Cards(page).text and new._mode is None
     (rest,) = pictures(sensor._repr_html_())

@@ -26,9 +26,12 @@ class Collision:
     """Contact buffers of a batch of environments; every buffer grows when it is too small.
 
     Args:
+        layout: bodies of the world.
+        batch: number of environments B.
         d_hat: distance below which surfaces repel [m].
         margin: widening of the vertices' boxes [m].
         deterministic: sort the lists, and add up in their order.
+        device: that holds all buffers.
         broad_phase: search for pairs, as in :class:`ipc.settings.Settings`.
     """
 
@@ -46,37 +49,55 @@ class Collision:
         # Threads that share the pairs of an environment. One alone adds forces up in the order of the lists.
         self.lanes = max(32, min(1024, 2**17 // batch)) if device.is_cuda and not deterministic else 1
         self._sort = deterministic and device.is_cuda
-        verts, bodies = int(layout.vert_start[-1]), len(layout.names)
-        plane_vert, plane_body, plane_pair = [], [], []
-        meshes = []
-        for index, (a, b) in enumerate(layout.pairs):
-            if layout.half_space[b]:
-                ids = np.arange(int(layout.vert_start[a]), int(layout.vert_start[a + 1]))
-                plane_vert.append(ids)
-                plane_body.append(np.full(len(ids), b))
-                plane_pair.append(np.full(len(ids), index))
-            else:
-                meshes.append((index, int(a), int(b)))
-        self.planes = sum(len(p) for p in plane_vert)
-        self.friction: bool = bool((layout.friction > 0).any())
+        pairs = [(index, int(a), int(b)) for index, (a, b) in enumerate(layout.pairs)]
+        mesh_pairs = [pair for pair in pairs if not layout.half_space[pair[2]]]
+        self._meshes = len(mesh_pairs) > 0
+        self._make_surface(layout, [pair for pair in pairs if layout.half_space[pair[2]]])
+        by_trees = broad_phase == "bvh" or (broad_phase == "auto" and trees_pay(layout, mesh_pairs, device.is_cuda))
+        self._trees = Trees(layout, mesh_pairs, batch, device) if by_trees and mesh_pairs else None
+        self._make_searches(layout, mesh_pairs if self._trees is None else [])
+        self._make_boxes(layout)
+        self.candidates = lists.Candidates()
+        self.candidates.pt_count, self.candidates.ee_count = self._zeros((batch,), wp.int32), self._zeros((batch,), wp.int32)
+        self.candidates.moved = self._zeros((batch,), wp.float64)
+        verts = int(layout.vert_start[-1])
+        self._reach = Reach(batch, verts, d_hat, device)
+        self._size_candidates(512, 1024)
+        self.contacts = contacts.Contacts()
+        self.contacts.count, self.contacts.row_count = self._zeros((batch,), wp.int32), self._zeros((batch,), wp.int32)
+        self._make_friction(layout)
+        self._size_contacts(256, 768)
+        self.overflow = self._zeros((1,), wp.int32)
+        self._any_stale = self._zeros((1,), wp.int32)
+        self._change, self._change_size = self._zeros((batch, verts), wp.vec3d), self._zeros((batch, verts), wp.float64)
+        self._force = self._zeros((batch, 2), wp.float64)
+        self._reduce = Reducer(batch, max(1, verts), device)
+        self._reduce.prepare(verts)
 
-        def ints(parts: list) -> wp.array:
-            return wp.array(np.concatenate([np.zeros(0), *parts]).astype(np.int32), dtype=wp.int32, device=device)
+    # --- parts of the constructor ----------------------------------------------------------------------------------------------
 
+    def _make_surface(self, layout: Layout, plane_pairs: list[tuple[int, int, int]]) -> None:
+        """Geometry of all surfaces, and the vertices that may meet a plane.
+
+        ``plane_pairs``: number of each body pair with a half-space, its first body and the half-space.
+        """
         shapes = ("edges", "faces", "vert_area", "edge_area", "edge_rest2")
-        self.surface = filled(lists.Surface, device, {name: getattr(layout, name) for name in shapes})
-        self.surface.plane_vert, self.surface.plane_body, self.surface.plane_pair = map(
-            ints, (plane_vert, plane_body, plane_pair)
-        )
-        self.surface.d_hat = d_hat
-        self.pair_mu = wp.array(layout.friction, dtype=wp.float64, device=device)
-        self.vert_body = wp.array(layout.vert_body, dtype=wp.int32, device=device)
+        self.surface = filled(lists.Surface, self.device, {name: getattr(layout, name) for name in shapes})
+        verts = [np.arange(int(layout.vert_start[a]), int(layout.vert_start[a + 1])) for _, a, _ in plane_pairs]
+        counts = [len(ids) for ids in verts]
+        self.planes = sum(counts)
+        self.surface.plane_vert = self._ints(verts)
+        self.surface.plane_body = self._ints([np.full(n, plane) for n, (_, _, plane) in zip(counts, plane_pairs, strict=True)])
+        self.surface.plane_pair = self._ints([np.full(n, index) for n, (index, _, _) in zip(counts, plane_pairs, strict=True)])
+        self.surface.d_hat = self.d_hat
+        self.vert_body = wp.array(layout.vert_body, dtype=wp.int32, device=self.device)
 
-        self._meshes = len(meshes) > 0
-        by_trees = broad_phase == "bvh" or (broad_phase == "auto" and trees_pay(layout, meshes, device.is_cuda))
-        self._trees = Trees(layout, meshes, batch, device) if by_trees and meshes else None
+    def _make_searches(self, layout: Layout, mesh_pairs: list[tuple[int, int, int]]) -> None:
+        """Lists of primitives, and the searches between them.
 
-        # Lists of primitives, six a body pair (three where a body meets itself): see _searches.
+        Points are searched against triangles and edges against edges. A body pair takes six lists, or three where a body meets itself.
+        A search is (edges?, list, other list, body pair, size of the first list).
+        """
         kinds, members, others, numbers, starts = [], [], [], [], [0]
         ranges = (layout.vert_start, layout.edge_start, layout.face_start)
 
@@ -90,7 +111,7 @@ class Collision:
             return len(starts) - 2
 
         self._searches: list[tuple[bool, int, int, int, int]] = []
-        for index, a, b in meshes if self._trees is None else []:
+        for index, a, b in mesh_pairs:
             va, ea, fa = (add_list(kind, a, b) for kind in range(3))
             if a == b:
                 self._searches += [(False, va, fa, index, len(members[va])), (True, ea, ea, index, len(members[ea]))]
@@ -101,26 +122,30 @@ class Collision:
                 (False, vb, fa, index, len(members[vb])),
                 (True, ea, eb, index, len(members[ea])),
             ]
-        self._prim_kind, self._prim_index, self._prim_other, self._prim_list = map(ints, (kinds, members, others, numbers))
+        self._prim_kind, self._prim_index, self._prim_other, self._prim_list = map(self._ints, (kinds, members, others, numbers))
         self._prims = starts[-1]
-        self._list_start = wp.array(np.array(starts, np.int32), dtype=wp.int32, device=device)
-        self._list_count = wp.zeros((batch, max(1, len(starts) - 1)), dtype=wp.int32, device=device)
-        self._members = wp.zeros((batch, max(1, starts[-1])), dtype=wp.int32, device=device)
+        self._list_start = wp.array(np.array(starts, np.int32), dtype=wp.int32, device=self.device)
+        self._list_count = self._zeros((self.batch, max(1, len(starts) - 1)), wp.int32)
+        self._members = self._zeros((self.batch, max(1, starts[-1])), wp.int32)
+
+    def _make_boxes(self, layout: Layout) -> None:
+        """Boxes of vertices and bodies; empty ones, so that the first check builds a list."""
+        verts, bodies = int(layout.vert_start[-1]), len(layout.names)
         self._boxes = lists.Boxes()
-        self._boxes.low, self._boxes.high = (wp.zeros((batch, verts), dtype=wp.vec3d, device=device) for _ in range(2))
-        self._boxes.body_low, self._boxes.body_high = (wp.zeros((batch, bodies), dtype=wp.vec3d, device=device) for _ in range(2))
-        self._stale = wp.zeros(batch, dtype=wp.int32, device=device)
-        self.candidates = lists.Candidates()
-        self.candidates.pt_count, self.candidates.ee_count = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
-        self.candidates.moved = wp.zeros(batch, dtype=wp.float64, device=device)
-        self._reach = Reach(batch, verts, d_hat, device)
-        self._size_candidates(512, 1024)
-        self.contacts = contacts.Contacts()
-        self.contacts.count, self.contacts.row_count = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
+        self._boxes.low, self._boxes.high = (self._zeros((self.batch, verts), wp.vec3d) for _ in range(2))
+        self._boxes.body_low, self._boxes.body_high = (self._zeros((self.batch, bodies), wp.vec3d) for _ in range(2))
+        self._boxes.low.fill_(wp.vec3d(1.0, 1.0, 1.0))  # above ``high``
+        self._stale = self._zeros((self.batch,), wp.int32)
+
+    def _make_friction(self, layout: Layout) -> None:
+        """Properties of the bodies that friction reads, and its lists without entries."""
+        bodies = len(layout.names)
+        self.friction: bool = bool((layout.friction > 0).any())
+        self.pair_mu = wp.array(layout.friction, dtype=wp.float64, device=self.device)
         self.lagged, self._old, self.memory = friction.Lagged(), friction.Lagged(), friction.Memory()
         for pairs in (self.lagged, self._old, self.memory):
-            pairs.count = wp.zeros(batch, dtype=wp.int32, device=device)
-        self.lagged.fresh, self._old.fresh = (wp.zeros(batch, dtype=wp.int32, device=device) for _ in range(2))
+            pairs.count = self._zeros((self.batch,), wp.int32)
+        self.lagged.fresh, self._old.fresh = self._zeros((self.batch,), wp.int32), self._zeros((self.batch,), wp.int32)
         self._index = friction.Index()
         framed = layout.frame_moves[:bodies] == 1
         soft = np.diff(layout.node_start) > 0
@@ -129,28 +154,25 @@ class Collision:
         first, second = layout.pairs.T
         values = {"framed": framed, "node_start": layout.node_start, "body": np.where(rank[first] > rank[second], first, second)}
         values["vert_body"] = layout.vert_body
-        self._turning = filled(friction.Turning, device, values)
-        self._turning.turn = wp.zeros((batch, bodies), dtype=wp.mat33d, device=device)
-        self._size_contacts(256, 768)
-        self.overflow = wp.zeros(1, dtype=wp.int32, device=device)
-        self._any_stale = wp.zeros(1, dtype=wp.int32, device=device)
-        self._change = wp.zeros((batch, verts), dtype=wp.vec3d, device=device)
-        self._change_size = wp.zeros((batch, verts), dtype=wp.float64, device=device)
-        self._force = wp.zeros((batch, 2), dtype=wp.float64, device=device)
-        self._reduce = Reducer(batch, max(1, verts), device)
-        self._reduce.prepare(verts)
-        self._boxes.low.fill_(wp.vec3d(1.0, 1.0, 1.0))  # an empty box (low above high): the first check builds a list
+        self._turning = filled(friction.Turning, self.device, values)
+        self._turning.turn = self._zeros((self.batch, bodies), wp.mat33d)
+
+    def _ints(self, parts: list) -> wp.array:
+        return wp.array(np.concatenate([np.zeros(0), *parts]).astype(np.int32), dtype=wp.int32, device=self.device)
+
+    def _zeros(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device=self.device)
 
     # --- buffers ---------------------------------------------------------------------------------------------------------------
 
     def _size_candidates(self, pt: int, ee: int) -> None:
-        self.candidates.pt, self.candidates.ee = (wp.zeros((self.batch, n), dtype=wp.vec3i, device=self.device) for n in (pt, ee))
-        rooms = {"pt_gap": pt, "ee_gap": ee}
-        for name, room in rooms.items():
-            setattr(self.candidates, name, wp.zeros((self.batch, room), dtype=wp.float64, device=self.device))
-        self._ordered = {n: wp.zeros((self.batch, n), dtype=wp.vec3i, device=self.device) for n in (pt, ee) if self._sort}
+        """Make lists for ``pt`` pairs of point and triangle and ``ee`` pairs of edges, empty."""
+        self.candidates.pt, self.candidates.ee = (self._zeros((self.batch, n), wp.vec3i) for n in (pt, ee))
+        self.candidates.pt_gap, self.candidates.ee_gap = (self._zeros((self.batch, n), wp.float64) for n in (pt, ee))
+        self._ordered = {n: self._zeros((self.batch, n), wp.vec3i) for n in (pt, ee) if self._sort}
 
     def _size_contacts(self, pairs: int, rows: int) -> None:
+        """Make room for contacts of ``pairs`` and their Hessian's ``rows``; what is there is kept."""
         place = {"verts": wp.vec4i, "coef": wp.vec4d, "normal": wp.vec3d, "pair": wp.int32}
         self._resize(self.contacts, place | {"force": wp.float64, "gap": wp.float64}, pairs)
         fields = {
@@ -174,25 +196,25 @@ class Collision:
     def _resize(self, struct: Any, fields: dict[str, Any], room: int) -> None:
         """Give arrays of a struct another second dimension; what they hold is kept."""
         for name, dtype in fields.items():
-            new = wp.zeros((self.batch, room), dtype=dtype, device=self.device)
+            new = self._zeros((self.batch, room), dtype)
             before = getattr(struct, name)
             if before is not None:
-                values, both = new.numpy(), min(room, before.shape[1])
-                values[:, :both] = before.numpy()[:, :both]
+                values, kept = new.numpy(), min(room, before.shape[1])
+                values[:, :kept] = before.numpy()[:, :kept]
                 new.assign(values)
             setattr(struct, name, new)
 
     def grow(self) -> None:
         """Make room for twice what did not fit; new lists are made at the next check."""
         counts = (self.candidates.pt_count, self.candidates.ee_count, self.contacts.count, self.contacts.row_count)
-        rooms = (self.candidates.pt, self.candidates.ee, self.contacts.force, self.contacts.row)
-        most = [int(c.numpy().max()) for c in counts]
-        room = [r.shape[1] for r in rooms]
-        pt, ee, pairs, rows = (max(r, int(_GROW * m)) if m > r else r for r, m in zip(room, most, strict=True))
-        if (pt, ee) != (room[0], room[1]):
+        buffers = (self.candidates.pt, self.candidates.ee, self.contacts.force, self.contacts.row)
+        needed = [int(count.numpy().max()) for count in counts]
+        room = [values.shape[1] for values in buffers]
+        pt, ee, pairs, rows = (_GROW * need if need > size else size for size, need in zip(room, needed, strict=True))
+        if [pt, ee] != room[:2]:
             self._size_candidates(pt, ee)
             self.forget(np.ones(self.batch, bool))
-        if (pairs, rows) != (room[2], room[3]):
+        if [pairs, rows] != room[2:]:
             self._size_contacts(pairs, rows)
         self.overflow.zero_()
 
@@ -232,11 +254,9 @@ class Collision:
         self._launch(lists.check_candidates, self.batch, [candidates], [self.overflow])
 
     def _search_lists(self) -> None:
-        """All against all, of the primitives that reach the other body."""
-        inputs = [
-            *(self._boxes, self.surface, self._prim_kind, self._prim_index, self._prim_other, self._prim_list),
-            *(self._list_start, self._stale),
-        ]
+        """Search all against all, among the primitives that reach the other body."""
+        prims = [self._prim_kind, self._prim_index, self._prim_other, self._prim_list]
+        inputs = [self._boxes, self.surface, *prims, self._list_start, self._stale]
         self._launch(lists.select_prims, (self.batch, self._prims), inputs, [self._list_count, self._members])
         common = [self._boxes, self.surface, self._members, self._list_start, self._list_count]
         for *search, size in self._searches:
@@ -264,7 +284,17 @@ class Collision:
         gradient: wp.array,
         energy: wp.array,
     ) -> None:
-        """Contacts, rows, ``gradient`` (B, V) [N], ``energy`` (B,) [J]; sets ``overflow``."""
+        """Contacts at x with their rows of the Hessian; sets ``overflow`` if they do not fit.
+
+        Args:
+            x, start: vertices now and at the start of the step [m], (B, V).
+            R, t: rotations and positions of frames (B, frames).
+            kappa: stiffness of the barrier (B,).
+            friction_eps: ε, the slip at which friction yields [m].
+            last: slip below which rows of friction have the majoriser's curvature alone [m], (B,).
+            active: mask (B,).
+            gradient, energy: become the gradient (B, V) [N] and the energy of the barrier (B,) [J].
+        """
         outputs = [gradient, energy, self.contacts]
         self._launch(contacts.clear, x.shape, [active], outputs)
         if self._meshes:

@@ -92,7 +92,7 @@ def clear(active: IntArray, gradient: VecArray2d, energy: FloatArray, out: Conta
 
 @wp.kernel
 def check_contacts(contacts: Contacts, overflow: IntArray):
-    """Raises the flag if contacts or rows did not fit."""
+    """Raise the flag if contacts or rows did not fit."""
     env = wp.tid()
     if contacts.count[env] > contacts.force.shape[1] or contacts.row_count[env] > contacts.row.shape[1]:
         overflow[0] = 1

@@ -13,21 +13,21 @@ contact problems involving friction", section 3); that E is linear beyond ε mak
 moves, nothing is forgotten, in any number of steps. The Hessian μ λ [(f1/y)(1 − ŵ ŵᵀ) + f1' ŵ ŵᵀ] has no negative eigenvalue: two rows,
 along ŵ and across it.
 
-*What remembers.* Pairs do, known by their vertices: point and triangle, two edges, point and plane. Pairs within d̂ come and go with the
-barrier's force, so a new one begins with no slip and hardly a force, and one that has left is forgotten. Slip kept at vertices would have
-to be averaged from the pairs and back in each step, which smooths the tractions away; pairs keep it to the last bit. Where a contact
-slides or rolls on to other primitives, what is lost is at most a slip of ε. Pairs are found by a hash of their vertices. Where two slots
-of it collide, the lowest index wins, so nothing depends on scheduling.
+*Memory.* Slip is kept by pair: of point and triangle, two edges, or point and plane. A pair is known by its vertices. Pairs within d̂ come
+and go with the barrier's force, so a new one begins with no slip and hardly a force, and one that has parted is forgotten. Slip kept at
+vertices would have to be averaged from the pairs and back in each step, which smooths the tractions away; pairs keep it to the last bit.
+Where a contact slides or rolls on to other primitives, a slip of at most ε is lost. A hash of the vertices gives a pair's entry. Where
+several pairs share a slot, the lowest index counts, so nothing depends on scheduling.
 
-*Landing.* A pair that was farther apart than d̂ at the start of the step slides only from where it lands. What its frames let it slide
-before is taken off: with their relative displacement d in the step, and the gap g0 at its start, it lands after the share
-(g0 − d̂)/(−d·n) of it. Otherwise a ball that is driven down in steps of 0.1 mm would drag gel along that it has not touched yet. Where
-that share is above 1, a body without a frame, or gel that rises, has closed the gap, and all of the sliding counts; so it does on a
-plane, and where frames slide rather than land.
+*Landing.* A pair that was farther apart than d̂ at the start of the step slides only from where it lands. The sliding that its frames make
+before is subtracted: with their relative displacement d in the step, and the gap g0 at its start, the pair lands after the share
+(g0 − d̂)/(−d·n) of d. Otherwise a ball that is driven down in steps of 0.1 mm would drag gel along that it has not touched yet. Where that
+share is above 1, the gap was closed by a body without a frame or by gel that rises, and all of the sliding counts. All of it counts on a
+plane too, and where frames slide rather than land.
 
 *Frames.* z turns with one of the two bodies, the one that a frame carries if there is one, so that bodies which turn together keep their
-stress. The same turn Q moves the closest points, a gap d apart, by d (n − Qᵀ n) without any slip, which is taken off. In the step it is the
-turn that the frame is ordered to make, so that all its lags agree; what bodies without a frame turn counts at its end.
+stress. The same turn Q moves the closest points, a gap d apart, by d (n − Qᵀ n) without any slip; that is subtracted. During the step Q is
+the turn that the frame is to make in all of it, so that all lags agree. Turns of bodies without a frame count at the end of the step.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -150,7 +150,7 @@ def sliding(x: VecArray2d, start: VecArray2d, env: wp.int32, verts: wp.vec4i, c:
 
 @wp.func
 def rotation_in(A: wp.mat33d) -> wp.mat33d:
-    """The rotation nearest to A, from the identity on.
+    """The rotation nearest to A, by iteration from the identity.
 
     Müller et al. 2016, "A Robust Method to Extract the Rotational Part of Deformations".
     """
@@ -182,9 +182,9 @@ def turns_ahead(turning: Turning, active: IntArray, turn: MatArray2d):
 
 @wp.kernel
 def turns(turning: Turning, y: VecArray2d, R: MatArray2d, active: IntArray, turn: MatArray2d):
-    """Q of every body from the start of the step to y and R.
+    """Q of every body from the start of the step to nodes y and frames R.
 
-    It is that of up to 256 nodes where no frame carries the body.
+    Where no frame carries the body, it is the rotation that fits some of its nodes best, at most about 256.
     """
     env, body = wp.tid()
     if active[env] == 0:
@@ -230,7 +230,7 @@ def find_pair(
 ) -> wp.int32:
     """Entry of a pair, −1 without one.
 
-    Two edges of a body may have the vertices of a point and a triangle; the lowest entry counts.
+    Two edges of a body may have the same four vertices as a point and a triangle: the lowest entry counts.
     """
     entry = wp.int32(-1)
     k = index.first[env, slot_of(v, index.first.shape[1])]
@@ -245,6 +245,7 @@ def find_pair(
 
 @wp.kernel
 def clear_index(active: IntArray, index: Index):
+    """Empty the hash."""
     env, i = wp.tid()
     if active[env] != 0:
         index.first[env, i] = -1
@@ -252,7 +253,7 @@ def clear_index(active: IntArray, index: Index):
 
 @wp.kernel
 def fill_index(verts: wp.array2d(dtype=wp.vec4i), count: IntArray, active: IntArray, index: Index):
-    """Enters all pairs into the hash."""
+    """Enter all pairs into the hash."""
     env, i = wp.tid()
     if active[env] != 0 and i < count[env]:
         index.next[env, i] = wp.atomic_exch(index.first, env, slot_of(verts[env, i], index.first.shape[1]), i)
@@ -260,7 +261,7 @@ def fill_index(verts: wp.array2d(dtype=wp.vec4i), count: IntArray, active: IntAr
 
 @wp.func
 def copy_pair(pairs: Lagged, env: wp.int32, i: wp.int32, out: Lagged, k: wp.int32):
-    """Entry k of ``out`` becomes entry i of ``pairs``."""
+    """Copy entry i of ``pairs`` to entry k of ``out``."""
     out.verts[env, k] = pairs.verts[env, i]
     out.coef[env, k] = pairs.coef[env, i]
     out.normal[env, k] = pairs.normal[env, i]
@@ -274,7 +275,7 @@ def copy_pair(pairs: Lagged, env: wp.int32, i: wp.int32, out: Lagged, k: wp.int3
 
 @wp.kernel
 def keep_lagged(lagged: Lagged, active: IntArray, out: Lagged):
-    """Copies the lagged pairs of the active environments."""
+    """Copy the lagged pairs of the active environments."""
     env, i = wp.tid()
     if active[env] == 0:
         return
@@ -287,7 +288,7 @@ def keep_lagged(lagged: Lagged, active: IntArray, out: Lagged):
 
 @wp.kernel
 def weigh_fresh(share: FloatArray, active: IntArray, out: Lagged):
-    """Multiplies the limits of the fresh pairs by their share."""
+    """Multiply the limits of the fresh pairs by their share."""
     env, i = wp.tid()
     if active[env] != 0 and i < out.fresh[env]:
         out.limit[env, i] = share[env] * out.limit[env, i]
@@ -295,11 +296,10 @@ def weigh_fresh(share: FloatArray, active: IntArray, out: Lagged):
 
 @wp.kernel
 def add_old(old: Lagged, share: FloatArray, index: Index, active: IntArray, lanes: wp.int32, out: Lagged):
-    """Adds what the average has of the last lag's fresh pairs.
+    """Add what the average has of the fresh pairs of the lag before.
 
-    It goes to the same pair, or is one of its own where that has gone.
-
-    So no pair is kept beyond two lags, and there are never more than twice as many as contacts.
+    A limit is added to the same pair of the new lag; where that pair has gone, the old one is appended. No pair is kept beyond two lags, so
+    there are never more than twice as many as contacts.
     """
     env, lane = wp.tid()
     if active[env] == 0:
@@ -329,7 +329,7 @@ def carried(turning: Turning, env: wp.int32, v: wp.int32) -> wp.vec3d:
 def slid_before_contact(
     turning: Turning, env: wp.int32, verts: wp.vec4i, c: wp.vec4d, n: wp.vec3d, turn: wp.mat33d, d_hat: wp.float64
 ) -> wp.vec3d:
-    """Sliding [m] of a new pair, as its frames move, before it comes within d̂ in a step."""
+    """Sliding [m] that the frames of a new pair make in the step before it comes within d̂."""
     if verts[1] < 0:  # a plane
         return wp.vec3d()
     gap, d, n_start = wp.float64(0.0), wp.vec3d(), wp.transpose(turn) * n
@@ -356,7 +356,7 @@ def lag_contacts(
     # outputs
     out: Lagged,
 ):
-    """Freezes the contacts of the active environments, with what they remember.
+    """Hold fixed the contacts of the active environments, with what they remember.
 
     ``relags`` is −1 at the start of the step.
     """
@@ -521,7 +521,7 @@ def friction_change(
     # outputs
     change: FloatArray,
 ):
-    """Adds the change of the friction potential from x0 to x1 [J]."""
+    """Add the change of the friction potential from x0 to x1 [J]."""
     env, lane = wp.tid()
     if active[env] == 0:
         return
@@ -534,11 +534,10 @@ def friction_change(
 
 @wp.kernel
 def lag_difference(lagged: Lagged, sign: wp.float64, active: IntArray, lanes: wp.int32, force: VecArray2d, size: FloatArray2d):
-    """Adds sign · μ λ c_i n of every lagged pair to its vertices [N].
+    """Add sign · μ λ c_i n of every lagged pair to its vertices [N], and μ λ to ``size`` [N].
 
-    μ λ is added to ``size`` [N] of its sign.
-
-    Called with + for the new and − for the old pairs, it leaves what changed of the normal forces *and* of where they act.
+    Called with + for the new and − for the old pairs, it gives the change of the normal forces *and* of where they act. ``size`` has one
+    sum for either sign, (B, 2).
     """
     env, lane = wp.tid()
     if active[env] == 0:
@@ -553,6 +552,7 @@ def lag_difference(lagged: Lagged, sign: wp.float64, active: IntArray, lanes: wp
 
 @wp.kernel
 def clear_change(active: IntArray, change: VecArray2d, force: FloatArray2d, changed: FloatArray):
+    """Set the sums of ``lag_difference`` to 0."""
     env, v = wp.tid()
     if active[env] == 0:
         return
@@ -565,6 +565,7 @@ def clear_change(active: IntArray, change: VecArray2d, force: FloatArray2d, chan
 
 @wp.kernel
 def size_of_change(change: VecArray2d, active: IntArray, size: FloatArray2d):
+    """Length of the change at every vertex [N]."""
     env, v = wp.tid()
     if active[env] != 0:
         size[env, v] = wp.length(change[env, v])

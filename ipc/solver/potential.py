@@ -31,7 +31,12 @@ class Potential:
     """State and work space of a batch, and the launches that evaluate them.
 
     Args:
-        d_hat: [m].    kappa: [Pa].
+        layout: bodies of the world.
+        settings: of the solver.
+        batch: number of environments B.
+        d_hat: distance below which surfaces repel [m].
+        kappa: stiffness of the barrier [Pa].
+        device: that holds all arrays.
     """
 
     def __init__(self, layout: Layout, settings: Settings, batch: int, d_hat: float, kappa: float, device: wp.Device) -> None:
@@ -207,20 +212,9 @@ class Potential:
 
     def touch(self, active: wp.array) -> None:
         """Contacts, their forces and rows at x."""
-        self.collision.assemble(
-            *(
-                self.x,
-                self.x_start,
-                self.R,
-                self.t,
-                self.kappa,
-                self.friction_eps,
-                self.last,
-                active,
-                self.vert_gradient,
-                self.barrier,
-            )
-        )
+        placed = self.R, self.t
+        outputs = self.vert_gradient, self.barrier
+        self.collision.assemble(self.x, self.x_start, *placed, self.kappa, self.friction_eps, self.last, active, *outputs)
 
     def assemble(self, active: wp.array) -> None:
         """Forces, contacts and energies at y; ``residual`` is −``gradient`` on the unknowns."""
@@ -284,9 +278,8 @@ class Potential:
         inputs = [self.y, self.y1, self.local_target, self.local_start, self.masses, self.dt, active]
         self.launch(dynamics.inertia_change, self.y.shape, inputs, [self.node_change])
         self.reduce(self.node_change, active, SUM, change)
-        self.collision.energy_change(
-            *(self.x, self.x1, self.x_start, self.R, self.t, self.kappa, self.friction_eps, active, change)
-        )
+        placed = self.R, self.t
+        self.collision.energy_change(self.x, self.x1, self.x_start, *placed, self.kappa, self.friction_eps, active, change)
 
     def slope(self, active: wp.array, slope: wp.array, noise: wp.array) -> None:
         """``slope`` (B,) ← g·p [J]; ``noise`` (B,) ← Σ ‖force‖ [N], for rounding of energies."""

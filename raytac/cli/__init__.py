@@ -10,6 +10,9 @@ import signal
 import sys
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
+from types import NoneType
+from typing import Any, get_args
 
 from raytac import __version__
 from raytac.errors import InputError, RaytacError
@@ -29,7 +32,7 @@ COMMANDS = {
     "bake": ("BakeArgs", "bake a Taxim table from the ray tracer of a sensor"),
     "calibrate": ("CalibrateArgs", "fit a sensor to photographs, or its markers to the soft pad"),
     "compare-real": ("CompareRealArgs", "fit to some photographs of presses and test on the others"),
-    "doctor": ("DoctorArgs", "try everything that the jobs need, and say how to mend it"),
+    "doctor": ("DoctorArgs", "try everything that the jobs need, and say how to fix it"),
 }
 """Class of each command, in the module of its name, and its line in the overview."""
 
@@ -90,10 +93,39 @@ def _run(args: Sequence[str]) -> int:
     if not args or args[0] not in COMMANDS:
         return _overview(args)
     import tyro
+    from tyro.constructors import ConstructorRegistry
 
+    registry = ConstructorRegistry()
+    registry.primitive_rule(_optional)
     module = importlib.import_module(f"raytac.cli.{args[0].replace('-', '_')}")
     command = getattr(module, COMMANDS[args[0]][0])
-    return tyro.cli(command, prog=f"raytac {args[0]}", args=args[1:]).run()
+    with registry:
+        parsed = tyro.cli(command, prog=f"raytac {args[0]}", args=args[1:])
+    return parsed.run()
+
+
+def _optional(option: Any) -> Any:
+    """Rule by which tyro reads ``T | None`` as T, so that help and errors name T alone."""
+    from tyro.constructors import PrimitiveConstructorSpec
+
+    kinds = [kind for kind in get_args(option.type) if kind is not NoneType]
+    if NoneType not in get_args(option.type) or len(kinds) != 1 or kinds[0] not in (int, float, str, Path):
+        return None
+    kind = kinds[0]
+
+    def read(words: list[str]) -> Any:
+        try:
+            return kind(words[0])
+        except ValueError:
+            raise ValueError(f"must be a {'whole ' if kind is int else ''}number, not {words[0]!r}") from None
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=kind.__name__.upper(),
+        instance_from_str=read,
+        is_instance=lambda value: value is None or isinstance(value, kind),
+        str_from_instance=lambda value: [str(value)],
+    )
 
 
 def _overview(args: Sequence[str]) -> int:

@@ -9,7 +9,7 @@ from raytac.doctor import diagnose
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorArgs:
-    """Try everything that the jobs need, say what will be used and how to mend what is missing.
+    """Try everything that the jobs need, say what will be used and how to fix what is missing.
 
     Exit code 1 only if the default job (rigid pad, ray tracer) cannot run.
     """

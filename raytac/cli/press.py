@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +14,7 @@ import tyro
 
 from raytac.cli.shared import ShadowOptions, SolverOptions, chosen_physics, named, print_paths
 from raytac.frame import OUTPUTS
+from raytac.io.metrics import Metric, read_metrics
 from raytac.io.options import parse_outputs, parse_resolution
 from raytac.markers import MARKERS
 from raytac.optics import INTEGRATORS, OPTICS, OpticalMode, OpticsConfig
@@ -76,6 +79,10 @@ class PressArgs(ShadowOptions, SolverOptions):
     """raytrace: rays a pixel (fast: a square number) or samples; 1 and 256 if not given."""
     resolution: str | None = None
     """WIDTHxHEIGHT of the images [px], as in 320x240, up to 8192; the sensor's if not given."""
+    pitch: float | None = None
+    """Spacing of the gel's height map [mm]; a pixel's, at most 0.1, if not given.
+
+    Sharp edges look smoother with a finer one, as 0.02."""
     noise: bool = False
     """Add the camera's grain to rgb.png, by the [noise] table of the sensor's file."""
     outputs: Annotated[str | None, named(OUTPUTS)] = None
@@ -106,6 +113,7 @@ class PressArgs(ShadowOptions, SolverOptions):
             optics=optics,
             outputs=computed,
             resolution=parse_resolution(self.resolution) if self.resolution is not None else None,
+            pitch=None if self.pitch is None else self.pitch / 1e3,
             device=self.device,
             seed=self.seed,
             markers=self.markers,
@@ -114,7 +122,17 @@ class PressArgs(ShadowOptions, SolverOptions):
         # Presses that differ in physics or optics do not replace each other.
         others = [name for name in (PHYSICS.name_of(physics), self.optics) if name not in ("rigid", "raytrace")]
         out = self.folder("press", "-".join([scene.name, *others]))
-        return print_paths(run_press(sensor, scene, out, outputs=outputs, start=start, progress=True))
+        written = run_press(sensor, scene, out, outputs=outputs, start=start, progress=True)
+        self._say_what_came_of_it(read_metrics(out / "metrics.json"))
+        return print_paths(written)
+
+    def _say_what_came_of_it(self, metrics: Mapping[str, Metric]) -> None:
+        """One line with the indentation, and with the force where it was asked for."""
+        text = f"indentation up to {metrics['contact.max_indentation_mm']:.3f} mm"
+        if "contact.force_z_n" in metrics:
+            x, y, z = (metrics[f"contact.force_{axis}_n"] for axis in "xyz")
+            text += f"; force on the pad {x:.2f}, {y:.2f}, {z:.2f} N along x, y, z (z points out of the gel)"
+        logging.getLogger("raytac").info(text)
 
     def _optics(self) -> OpticsConfig[OpticalMode]:
         """Configuration of the optical mode, with every option that was given as its field."""

@@ -85,7 +85,8 @@ class PressDataset:
         self.manifest = table.filter(keep)
         self.classes: tuple[str, ...] = tuple(self.description["plan"]["objects"])
         arrays, once = tuple(self.description["arrays"]), tuple(self.description["arrays_of_a_shard"])
-        known = (*arrays, *once, *(name for name, column in COLUMNS.items() if column.type != "string"), *_TEXTS, _LABEL)
+        numbers = tuple(name for name, column in COLUMNS.items() if column.type != "string")
+        known = tuple(dict.fromkeys((*arrays, *once, *numbers, *_TEXTS, _LABEL)))
         names = (*arrays, "object", _LABEL) if names is None else tuple(names)
         for name in names:
             if name not in known:
@@ -129,6 +130,9 @@ class PressDataset:
                 values = self._shard(self._shards[i])[name]
                 sample[name] = np.array(values if name in once else values[row])
         return sample if self._transform is None else self._transform(sample)
+
+    def __repr__(self) -> str:
+        return f"PressDataset({str(self.folder)!r}, {len(self)} presses; {', '.join(self._names)})"
 
     def _repr_html_(self) -> str:
         """Card for notebooks, with the first presses; of a video its last image."""

@@ -19,7 +19,7 @@ REQUIRED = ("index", "status", "shard", "row", "sensor", "shard_sha256")
 
 
 def check_pyarrow() -> None:
-    """Raises ``BackendError`` where Parquet cannot be written."""
+    """Raise ``BackendError`` where Parquet cannot be written."""
     try:
         import pyarrow  # noqa: F401
     except ImportError as error:
@@ -82,7 +82,7 @@ def read_manifest(folder: Path, sha256: str | None = None) -> Any:
     except OSError as error:
         raise InputError("data set", value=path, rule=f"cannot be read ({error.strerror})") from error
     if sha256 is not None and hashlib.sha256(data).hexdigest() != sha256:
-        raise InputError("data set", value=path, rule="differs from its checksum: render again to mend it")
+        raise InputError("data set", value=path, rule="differs from its checksum: render again to repair it")
     try:
         table = pq.read_table(pa.BufferReader(data))
     except (OSError, ValueError, pa.ArrowException) as error:

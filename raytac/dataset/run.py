@@ -133,7 +133,7 @@ def verify_dataset(folder: Path, *, progress: bool = False) -> Check:
     description = read_description(folder)
     manifest = Path(folder) / MANIFEST
     if description["complete"] and (not manifest.is_file() or sha256_of(manifest) != description["manifest_sha256"]):
-        raise InputError("data set", value=manifest, rule="is missing or differs from its checksum: render again to mend it")
+        raise InputError("data set", value=manifest, rule="is missing or differs from its checksum: render again to repair it")
     store = ShardStore(folder, description["plan_sha256"])
     wrong = {}
     for shard in Progress(range(description["shards"]), desc="verify", unit="shard", show=progress, leave=False):

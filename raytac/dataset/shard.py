@@ -156,7 +156,7 @@ def open_shard(
         with open_regular(path) as stream:
             data = np.memmap(stream, np.uint8, "r")  # one map a shard: an operating system has tens of thousands
             if sha256 is not None and hashlib.sha256(data.data).hexdigest() != sha256:
-                raise InputError("shard", value=path, rule="differs from its checksum: render again to mend it")
+                raise InputError("shard", value=path, rule="differs from its checksum: render again to repair it")
             with zipfile.ZipFile(stream) as archive:
                 members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
                 expected = KINDS if kinds is None else kinds

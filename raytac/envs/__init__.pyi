@@ -17,6 +17,7 @@ from .lift_cube import LiftCubeVectorEnv as LiftCubeVectorEnv
 from .open_drawer import OpenDrawer as OpenDrawer
 from .open_drawer import OpenDrawerEnv as OpenDrawerEnv
 from .open_drawer import OpenDrawerVectorEnv as OpenDrawerVectorEnv
+from .process_vector import ProcessVectorEnv as ProcessVectorEnv
 from .processes import one_thread as one_thread
 from .push_cube import PushCube as PushCube
 from .push_cube import PushCubeEnv as PushCubeEnv
@@ -29,7 +30,6 @@ from .roll_ball import RollBallEnv as RollBallEnv
 from .roll_ball import RollBallVectorEnv as RollBallVectorEnv
 from .rsl import RslVecEnv as RslVecEnv
 from .rsl import RslWarpEnv as RslWarpEnv
-from .sb3 import ProcessVecEnv as ProcessVecEnv
 from .sb3 import TactileVecEnv as TactileVecEnv
 from .scripted import SCRIPTED as SCRIPTED
 from .task_rules import Motion as Motion

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from multiprocessing.connection import Connection
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Unpack
 
 import gymnasium
@@ -13,28 +12,29 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from raytac.envs.batch import StepResult, TaskBatch, TaskOptions
-from raytac.envs.processes import serve
 from raytac.envs.task_rules import Task
 from raytac.errors import InputError
 from raytac.gel.surface import chosen_envs
 from raytac.observe import gymnasium_space
+from raytac.specs.sensor import SensorSpec
 from raytac.specs.sensor_check import view_edges
 
 _RENDER_MODES = ("rgb_array",)
 _GAIN = 4.0
 """Length of a drawn arrow over the marker's displacement, and of the difference from rest."""
 _PAPER, _INK, _DOT, _PLAIN = (250, 250, 250), (20, 60, 130), (90, 90, 90), 190
+"""Colours of a panel of markers, and the grey level of no difference."""
 
 
-class _Task:
-    """Common part of single environments and vectors: the batch, its pictures, and the end."""
+class _TaskEnv:
+    """Common part of single environments and vectors: the batch, its pictures, and closing."""
 
     task: ClassVar[type[Task]]
     metadata: dict[str, Any] = {"render_modes": list(_RENDER_MODES)}  # noqa: RUF012 (Gymnasium reads it from the class)
     closed = False
 
     def _compose(self, num_envs: int, render_mode: str | None, options: TaskOptions) -> None:
-        """Compose the world of ``TaskBatch``; InputError for an unknown mode; raises as it."""
+        """Make the batch; raises ``InputError`` for an unknown mode, and as ``TaskBatch``."""
         if render_mode is not None and render_mode not in _RENDER_MODES:
             raise InputError("render_mode", value=render_mode, rule="must be None or a known mode", choices=_RENDER_MODES)
         self.render_mode = render_mode
@@ -70,7 +70,7 @@ class _Task:
             self._picture = None
 
 
-class TactileEnv(_Task, gymnasium.Env):
+class TactileEnv(_TaskEnv, gymnasium.Env):
     """One environment of a task; subclasses name the task, and their docstring specifies it.
 
     Keyword arguments are those of ``TaskBatch`` without ``num_envs``. ``info`` holds ``reward_terms`` (name to value, their sum is the
@@ -128,7 +128,7 @@ class TactileEnv(_Task, gymnasium.Env):
         self._free()
 
 
-class TactileVectorEnv(_Task, gymnasium.vector.VectorEnv):
+class TactileVectorEnv(_TaskEnv, gymnasium.vector.VectorEnv):
     """B environments of a task in one world, stepped together and sensed in one call.
 
     Subclasses name the task. Keyword arguments are those of ``TaskBatch``. ``infos`` hold arrays (B,): ``reward_terms`` (name to array),
@@ -195,19 +195,20 @@ class TactileVectorEnv(_Task, gymnasium.vector.VectorEnv):
         Raises ``InputError`` for actions of another shape, outside of [−1, 1] or not finite, naming the environment; or after ``close``.
         """
         self._check_open()
-        late = np.flatnonzero(self._ended) if self._mode is AutoresetMode.NEXT_STEP else np.zeros(0, int)
+        # Those that are reset in place of this step.
+        waiting = np.flatnonzero(self._ended) if self._mode is AutoresetMode.NEXT_STEP else np.zeros(0, int)
         actions = np.asarray(actions)
-        if len(late) and actions.ndim and len(actions) == self.num_envs:
+        if len(waiting) and actions.ndim and len(actions) == self.num_envs:
             actions = actions.copy()
-            actions[late] = 0.0
-        out = self.batch.step(actions, np.isin(np.arange(self.num_envs), late) if len(late) else None)
+            actions[waiting] = 0.0
+        out = self.batch.step(actions, np.isin(np.arange(self.num_envs), waiting) if len(waiting) else None)
         observation, terms, reward = out.observation, out.terms, out.reward
         terminated, truncated, success, failed = out.terminated, out.truncated, out.success, out.failed
-        if len(late):
-            observation = self._reset(late)
+        if len(waiting):
+            observation = self._reset(waiting)
             for values in (reward, terminated, truncated, success, failed, *terms.values()):
-                values[late] = 0
-        infos = _infos(self.num_envs, {"reward_terms": terms, "success": success, "failed": failed})
+                values[waiting] = 0
+        infos = _infos(np.ones(self.num_envs, bool), {"reward_terms": terms, "success": success, "failed": failed})
         self._ended = terminated | truncated
         if self._mode is AutoresetMode.SAME_STEP and self._ended.any():
             ended = np.flatnonzero(self._ended)
@@ -229,13 +230,14 @@ class TactileVectorEnv(_Task, gymnasium.vector.VectorEnv):
         return self.batch.reset([int(b) for b in envs], [self._rngs[b] for b in envs])
 
     def _final(self, out: StepResult, ended: np.ndarray) -> dict[str, Any]:
+        """Entries ``final_obs`` and ``final_info`` of the environments that ended."""
         last, has_ended = np.full(self.num_envs, None, object), np.zeros(self.num_envs, bool)
         for b in ended:
             last[b] = {name: values[b].copy() for name, values in out.observation.items()}
         has_ended[ended] = True
         terms = {name: np.where(has_ended, term, 0.0) for name, term in out.terms.items()}
         final = {"reward_terms": terms, "success": out.success & has_ended, "failed": out.failed & has_ended}
-        info = _infos(self.num_envs, final)
+        info = _infos(has_ended, final)
         return {"final_obs": last, "_final_obs": has_ended, "final_info": info, "_final_info": has_ended.copy()}
 
 
@@ -248,25 +250,11 @@ def checked_mode(mode: str | AutoresetMode) -> AutoresetMode:
         raise InputError("autoreset_mode", value=mode, rule="must be a known mode", choices=choices) from error
 
 
-def serve_vector(pipe: Connection, kind: type[TactileVectorEnv], num_envs: int, options: dict[str, Any]) -> None:
-    """Serve a vector (``raytac.envs.processes.serve``); no learner's library is imported.
-
-    The first reply holds observation and action space of one environment; commands are ``("reset", seeds)`` and ``("step", actions)``.
-    """
-
-    def make() -> tuple[Any, dict[str, Callable[[Any], Any]]]:
-        env = kind(num_envs, **options)
-        spaces = env.single_observation_space, env.single_action_space
-        return spaces, {"reset": lambda seeds: env.reset(seed=seeds), "step": env.step}
-
-    serve(pipe, make)
-
-
 class EnvironmentPicture:
     """Pictures of a batch: the scene, and beside it what each sensor observes.
 
-    Of the modalities the image is shown, and markers with arrows of 4 times their displacement, turned as the image is, with x to the right
-    and y down, over 4 times the image's difference from rest.
+    Of the modalities the image is shown, and markers with arrows of 4 times their displacement over 4 times the image's difference from
+    rest. Both are turned as the image is, x to the right and y down.
     """
 
     def __init__(self, batch: TaskBatch, *, height: int = 240) -> None:
@@ -284,7 +272,7 @@ class EnvironmentPicture:
         )
 
     def draw(self, env: int, observation: Mapping[str, np.ndarray]) -> np.ndarray:
-        """8-bit picture (H, W, 3) of an environment with the goal; ``observation``: last (B, …)."""
+        """8-bit picture (H, W, 3) of an environment with the goal and its last observation."""
         columns = [self._camera.draw(env, [self._batch.goal[env]])]
         for name in self._batch.observers:
             panels = []
@@ -301,41 +289,57 @@ class EnvironmentPicture:
         """Free the renderer."""
         self._camera.close()
 
-    def _difference(self, name: str, image: np.ndarray) -> np.ndarray:
-        """Enlarged difference of an 8-bit image (H, W, 3) from rest, about a light grey."""
-        if name not in self._rest:
-            rest = self._batch.world.sensors[name].rest().rgb[0]  # type: ignore[index]
-            self._rest[name] = _resized(rest, image.shape[1], image.shape[0])
-        change = _GAIN * (image.astype(float) - self._rest[name])
-        return np.clip(_PLAIN + change, 0, 255).astype(np.uint8)
-
     def _markers(self, name: str, env: int, values: np.ndarray, seen: np.ndarray | None) -> np.ndarray:
-        from PIL import Image, ImageDraw
-
-        sensor = self._batch.world.sensors[name]
+        """Panel of a sensor's markers, the last of a stack, over the image that is seen."""
+        sensor, difference = self._batch.world.sensors[name], None
+        if seen is not None:
+            if name not in self._rest:
+                self._rest[name] = _resized(sensor.rest().rgb[0], seen.shape[1], seen.shape[0])
+            difference = magnified_difference(seen, self._rest[name])
         rest = sensor.marker_tracker.pattern.rest
         rest = rest[env if len(rest) > 1 else 0][:, :2]
         scale = self._batch.observers[name].settings.scale("markers")
-        displacement = values.reshape(-1, *rest.shape)[-1] * np.asarray(scale)  # the last of a stack [m]
-        size = np.array(sensor.spec.gelpad.size[:2])
-        factor = self._height / float(size.max())
-        width, height = (int(n) for n in np.ceil(factor * size))
-        image = Image.new("RGB", (width, height), _PAPER)
-        draw = ImageDraw.Draw(image)
+        displacement = values.reshape(-1, *rest.shape)[-1] * np.asarray(scale)
+        return marker_panel(sensor.spec, rest, displacement, self._height, behind=difference)
 
-        def pixel(point: np.ndarray) -> tuple[float, float]:
-            return width / 2 + factor * float(point[0]), height / 2 + factor * float(point[1])
 
-        if seen is not None:
-            (left, right), (top, bottom) = view_edges(sensor.spec)
-            low, high = pixel(np.array([left, top])), pixel(np.array([right, bottom]))
-            span = round(high[0]) - round(low[0]), round(high[1]) - round(low[1])
-            image.paste(Image.fromarray(_resized(self._difference(name, seen), *span)), (round(low[0]), round(low[1])))
-        for start, arrow in zip(rest, displacement, strict=True):
-            x, y = pixel(start)
-            draw.ellipse((x - 1, y - 1, x + 1, y + 1), fill=_DOT)
-            draw.line([(x, y), pixel(start + _GAIN * arrow)], fill=_INK, width=2)
-        return np.asarray(image)
+def magnified_difference(image: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """``_GAIN`` times an 8-bit image's difference from that at rest, about a light grey."""
+    change = _GAIN * (image.astype(float) - rest)
+    return np.clip(_PLAIN + change, 0, 255).astype(np.uint8)
+
+
+def marker_panel(
+    sensor: SensorSpec, rest: np.ndarray, displacement: np.ndarray, height: int, *, behind: np.ndarray | None = None
+) -> np.ndarray:
+    """8-bit picture (H, W, 3) of a pad with its markers, turned as the camera's image is.
+
+    Args:
+        sensor: gives the pad's size and the camera's view.
+        rest, displacement: places of the markers and their displacements, pad frame [m], (M, 2); arrows are ``_GAIN`` times as long.
+        height: of the picture [px], or its width if the pad is wider than high.
+        behind: 8-bit image (h, w, 3) of the camera's view, to show behind them; None is paper.
+    """
+    from PIL import Image, ImageDraw
+
+    size = np.array(sensor.gelpad.size)
+    px_per_m = height / float(size.max())
+    width, height = (int(n) for n in np.ceil(px_per_m * size))
+    image = Image.new("RGB", (width, height), _PAPER)
+    draw = ImageDraw.Draw(image)
+
+    def pixel(point: np.ndarray) -> tuple[float, float]:
+        return width / 2 + px_per_m * float(point[0]), height / 2 + px_per_m * float(point[1])
+
+    if behind is not None:
+        corners = np.array(view_edges(sensor)).T  # left top, right bottom
+        (left, top), (right, bottom) = ((round(u), round(v)) for u, v in map(pixel, corners))
+        image.paste(Image.fromarray(_resized(behind, right - left, bottom - top)), (left, top))
+    for start, arrow in zip(rest, displacement, strict=True):
+        x, y = pixel(start)
+        draw.ellipse((x - 1, y - 1, x + 1, y + 1), fill=_DOT)
+        draw.line([(x, y), pixel(start + _GAIN * arrow)], fill=_INK, width=2)
+    return np.asarray(image)
 
 
 def _enlarged(image: np.ndarray, height: int) -> np.ndarray:
@@ -363,11 +367,10 @@ def _row(observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: values[0] for name, values in observation.items()}
 
 
-def _infos(num_envs: int, values: dict[str, Any]) -> dict[str, Any]:
-    """Entries with the masks of Gymnasium's vectors: the environments that have an entry."""
+def _infos(having: np.ndarray, values: dict[str, Any]) -> dict[str, Any]:
+    """Entries with the masks of Gymnasium's vectors; ``having`` (B,): environments with one."""
     result: dict[str, Any] = {}
-    everywhere = np.ones(num_envs, bool)
     for name, value in values.items():
-        result[name] = _infos(num_envs, value) if isinstance(value, dict) else value
-        result[f"_{name}"] = everywhere.copy()
+        result[name] = _infos(having, value) if isinstance(value, dict) else value
+        result[f"_{name}"] = having.copy()
     return result

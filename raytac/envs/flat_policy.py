@@ -32,6 +32,9 @@ class FlatPolicy:
     def __init__(self, path: Path) -> None:
         """Load a ``policy.pt``. Raises ``InputError`` for a file that is none."""
         saved = read_tensors(path)
+        if isinstance(saved, dict) and "recipe" in saved:
+            rule = "is a checkpoint of train_ppo.py, not of raytac train: experiments/play.py of a checkout plays it"
+            raise InputError("policy", value=path, rule=rule)
         try:
             settings, weights = saved["settings"], saved["actor_state_dict"]
             self.task, self.touch, self.history = str(settings["task"]), str(settings["touch"]), int(settings["history"])

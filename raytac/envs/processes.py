@@ -47,7 +47,7 @@ class Workers:
         """Start the processes; return once every vector is made.
 
         Args:
-            serve: function that a process runs, with (pipe, kind, number of environments, options); see ``serve_vector``.
+            serve: function that a process runs, with (pipe, kind, number of environments, options); see ``serve``.
             kind: what makes a vector.
             num_envs: number of environments in all, the same number in each process.
             seed: of process 0; process k has seed + k num_envs / processes, so that no two environments have the same random stream.

@@ -1,11 +1,11 @@
-"""Environments for stable-baselines3: our vectors as its ``VecEnv``, also in processes."""
+"""``TactileVecEnv``: our vectors as the ``VecEnv`` of stable-baselines3."""
 
 # pyright: reportMissingImports=false
 # (stable-baselines3 and PyTorch belong to the extra "rl", which the tests do without.)
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,8 @@ import torch
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
-from raytac.envs.environments import TactileVectorEnv, serve_vector
-from raytac.envs.processes import Workers
+from raytac.envs.environments import TactileVectorEnv
+from raytac.envs.process_vector import ProcessVectorEnv
 from raytac.envs.warp_vector import WarpVectorEnv
 from raytac.errors import InputError
 
@@ -22,33 +22,8 @@ Observations = dict[str, np.ndarray]
 Step = tuple[Observations, np.ndarray, np.ndarray, list[dict[str, Any]]]
 
 
-class _DictVecEnv(VecEnv):
-    """Common part of both: attributes by name, and no wrappers."""
-
-    def close(self) -> None:
-        """Free nothing: there is only memory."""
-
-    def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
-        """Attribute of the vector, repeated for every environment of ``indices``."""
-        if attr_name != "render_mode":
-            raise AttributeError(attr_name)
-        return [None] * len(list(self._get_indices(indices)))
-
-    def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
-        """Raise ``InputError``: environments of one world share everything."""
-        raise InputError("attr_name", value=attr_name, rule="cannot be set: environments of a vector share their world")
-
-    def env_method(self, method_name: str, *args: Any, indices: int | Iterable[int] | None = None, **kwargs: Any) -> list[Any]:
-        """Raise ``InputError``: environments of one world have no methods of their own."""
-        raise InputError("method_name", value=method_name, rule="cannot be called: environments of a vector share their world")
-
-    def env_is_wrapped(self, wrapper_class: type, indices: int | Iterable[int] | None = None) -> list[bool]:
-        """False for every environment."""
-        return [False] * len(list(self._get_indices(indices)))
-
-
-class TactileVecEnv(_DictVecEnv):
-    """A ``TactileVectorEnv`` or ``WarpVectorEnv`` as a ``VecEnv`` for ``MultiInputPolicy``.
+class TactileVecEnv(VecEnv):
+    """A Gymnasium vector of ours as a ``VecEnv`` for ``MultiInputPolicy``.
 
     Stable-baselines3 takes arrays of NumPy: those of a ``WarpVectorEnv`` are copied to the host in every step.
 
@@ -57,7 +32,7 @@ class TactileVecEnv(_DictVecEnv):
     ``seed(s)`` before ``reset`` seeds environment b with s + b, and a ``WarpVectorEnv`` with s.
     """
 
-    def __init__(self, env: TactileVectorEnv | WarpVectorEnv) -> None:
+    def __init__(self, env: TactileVectorEnv | ProcessVectorEnv | WarpVectorEnv) -> None:
         """Wrap ``env``; InputError unless it resets environments in the step that ends them."""
         mode = env.metadata["autoreset_mode"]
         if mode is not AutoresetMode.SAME_STEP:
@@ -82,55 +57,27 @@ class TactileVecEnv(_DictVecEnv):
         """Step with the actions kept; InputError names an environment not finite or out of bounds."""
         return _vec_env_step(*(_on_host(one) for one in self.env.step(self._actions)))
 
-
-class ProcessVecEnv(_DictVecEnv):
-    """One ``VecEnv`` of ``processes`` vectors, each in a process with a world of its own.
-
-    The physics of a world runs on one core, so this uses a machine of many cores. Ctrl-C reaches the caller alone, and workers end with it.
-    """
-
-    def __init__(self, kind: type[TactileVectorEnv], *, num_envs: int, processes: int, seed: int = 0, **options: Any) -> None:
-        """Start the processes.
-
-        Args:
-            kind: the task's vector, such as ``PushCubeVectorEnv``.
-            num_envs: number of environments in all, the same number in each process.
-            processes: number of processes.
-            seed: of what is drawn once for a world. Process k has seed + k num_envs / processes, so that no two environments have the same
-                random stream.
-            options: of ``TaskBatch``; they must pickle.
-
-        Raises:
-            InputError: a number of environments that the processes cannot share evenly; as ``TaskBatch``.
-        """
-        self._workers = Workers(serve_vector, kind, num_envs, processes, seed, **options)
-        super().__init__(num_envs, *self._workers.made[0])
-
-    def reset(self) -> Observations:
-        """As ``TactileVecEnv.reset``."""
-        each = self._workers.each
-        self._workers.send("reset", [self._seeds[k * each : (k + 1) * each] for k in range(len(self._workers))])
-        self._reset_seeds()
-        self._reset_options()
-        return _joined([observation for observation, _ in self._workers.replies()])
-
-    def step_async(self, actions: np.ndarray) -> None:
-        """Start the step in all processes; InputError names an environment not finite."""
-        actions = np.asarray(actions)
-        if not np.isfinite(actions).all():
-            env = int(np.argwhere(~np.isfinite(actions))[0, 0])
-            raise InputError("actions", value=actions[env].tolist(), rule=f"must be finite; in environment {env} they are not")
-        self._workers.send("step", np.split(actions, len(self._workers)))
-
-    def step_wait(self) -> Step:
-        """Wait for the step; as ``TactileVecEnv.step_wait``, naming the process of an error."""
-        steps = [_vec_env_step(*reply) for reply in self._workers.replies()]
-        observations, rewards, dones, infos = zip(*steps, strict=True)
-        return _joined(observations), np.concatenate(rewards), np.concatenate(dones), [info for part in infos for info in part]
-
     def close(self) -> None:
-        """End the processes."""
-        self._workers.close()
+        """Close the vector: processes end."""
+        self.env.close()
+
+    def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
+        """Attribute of the vector, repeated for every environment of ``indices``."""
+        if attr_name != "render_mode":
+            raise AttributeError(attr_name)
+        return [None] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name: str, value: Any, indices: int | Iterable[int] | None = None) -> None:
+        """Raise ``InputError``: environments of one world share everything."""
+        raise InputError("attr_name", value=attr_name, rule="cannot be set: environments of a vector share their world")
+
+    def env_method(self, method_name: str, *args: Any, indices: int | Iterable[int] | None = None, **kwargs: Any) -> list[Any]:
+        """Raise ``InputError``: environments of one world have no methods of their own."""
+        raise InputError("method_name", value=method_name, rule="cannot be called: environments of a vector share their world")
+
+    def env_is_wrapped(self, wrapper_class: type, indices: int | Iterable[int] | None = None) -> list[bool]:
+        """False for every environment."""
+        return [False] * len(list(self._get_indices(indices)))
 
 
 def _on_host(values: Any) -> Any:
@@ -138,10 +85,6 @@ def _on_host(values: Any) -> Any:
     if isinstance(values, dict):
         return {name: _on_host(value) for name, value in values.items()}
     return values.cpu().numpy() if isinstance(values, torch.Tensor) else values
-
-
-def _joined(parts: Sequence[Observations]) -> Observations:
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _vec_env_step(

@@ -28,7 +28,8 @@ def summary(record: Any, names: Sequence[str] | None = None) -> str:
             text = "{" + ", ".join(f"{key}: {v}" for key, v in value.items()) + "}" if value else ""
         else:
             text = "" if value is None else _brief(value)
-        shown += [f"{name}={text}"] if text else []
+        if text:
+            shown.append(f"{name}={text}")
     return f"{type(record).__name__}({', '.join(shown)})"
 
 
@@ -72,23 +73,24 @@ class PadGrid:
 class GelSurface:
     """Coat surface of B pads on one grid.
 
-    height [m], shape (B, Ny, Nx), float32: z in the pad frame. contact, shape (B, Ny, Nx), bool: where the object touches.
-    contact_centre [m], shape (B, 2): x, y of the pressure-weighted (here: indentation-weighted) contact centroid, NaN without
-    contact.
-    pad_from_object, shape (B, 4, 4): pose of the object, or None when there is no object.
-    coat: the same surface as a mesh that moves sideways too, where the physics simulates the gel; None elsewhere.
-    ink, shape (B, Ny, Nx), float32: share of the skin that marker dots cover around each node, in [0, 1]; None without dots.
-
     Raises ``InputError`` for arrays of another kind or shape; heights of environments that failed may be NaN.
     """
 
     grid: PadGrid
     height: np.ndarray
+    """z in the pad frame [m], (B, Ny, Nx), float32."""
     contact: np.ndarray
+    """True where the object touches, (B, Ny, Nx), bool."""
     contact_centre: np.ndarray
+    """x, y of the contact's centre [m], (B, 2); NaN without contact.
+
+    It is weighted by the overlap under a rigid pad, by the normal load under a soft one."""
     pad_from_object: np.ndarray | None = None
+    """Pose of the object, (B, 4, 4); None without an object."""
     coat: DeformedCoat | None = None
+    """The same surface as a mesh that moves sideways too, of a soft pad; else None."""
     ink: np.ndarray | None = None
+    """Share in [0, 1] of the coat that marker dots cover, (B, Ny, Nx), float32, or None."""
 
     def __post_init__(self) -> None:
         expected = (len(self.height) if isinstance(self.height, np.ndarray) and self.height.ndim else 0, *self.grid.shape)
@@ -98,10 +100,10 @@ class GelSurface:
         for name, (kind, shape) in shapes.items():
             array = getattr(self, name)
             if not isinstance(array, np.ndarray) or array.dtype.kind != kind or array.shape != shape:
-                shown = (str(array.dtype), array.shape) if isinstance(array, np.ndarray) else type(array).__name__
-                kinds = {"f": "floating-point numbers", "b": "truth values"}[kind]
-                rule = f"must be an array of {kinds} of shape {shape}, as grid and height say"
-                raise InputError(f"surface.{name}", value=shown, rule=rule)
+                given = (str(array.dtype), array.shape) if isinstance(array, np.ndarray) else type(array).__name__
+                numbers = {"f": "floating-point numbers", "b": "truth values"}[kind]
+                rule = f"must be an array of {numbers} of shape {shape}, as grid and height say"
+                raise InputError(f"surface.{name}", value=given, rule=rule)
 
     def __repr__(self) -> str:
         return summary(self)
@@ -118,10 +120,10 @@ class GelSurface:
 
         ``contact`` (B, Ny, Nx), bool; None takes Taxim's rule, the nodes pressed in by more than 0.4 of the deepest.
         """
-        pressed = np.maximum(-displacement, 0.0)
-        deep = pressed > CONTACT_SCALE * pressed.max(axis=(1, 2), keepdims=True)
-        touched = deep if contact is None else contact
-        weight = np.where(touched, pressed, 0.0)
+        indentation = np.maximum(-displacement, 0.0)
+        is_deep = indentation > CONTACT_SCALE * indentation.max(axis=(1, 2), keepdims=True)
+        touched = is_deep if contact is None else contact
+        weight = np.where(touched, indentation, 0.0)
         total = weight.sum(axis=(1, 2))
         moments = np.stack([weight.sum(axis=1) @ grid.x, weight.sum(axis=2) @ grid.y], axis=1)
         centre = np.divide(moments, total[:, None], out=np.full((len(total), 2), np.nan), where=total[:, None] > 0.0)
@@ -133,11 +135,24 @@ class GelSurface:
 
     def rows(self, envs: Sequence[int] | np.ndarray) -> GelSurface:
         """The surfaces of some environments, one row each."""
-        some = {name: getattr(self, name)[envs] for name in ("height", "contact", "contact_centre")}
-        some |= {name: None if (v := getattr(self, name)) is None else v[envs] for name in ("pad_from_object", "ink")}
+        pose, coat, ink = self.pad_from_object, self.coat, self.ink
         return GelSurface(
-            self.grid, **some, coat=None if self.coat is None else replace(self.coat, positions=self.coat.positions[envs])
+            self.grid,
+            self.height[envs],
+            self.contact[envs],
+            self.contact_centre[envs],
+            None if pose is None else pose[envs],
+            None if coat is None else replace(coat, positions=coat.positions[envs]),
+            None if ink is None else ink[envs],
         )
+
+    @property
+    def is_finite(self) -> np.ndarray:
+        """Environments all of whose heights are finite, (B,), bool."""
+        # One NaN or infinity makes the sum of squares one, and no height is so large that it does: many times cheaper than asking
+        # every node.
+        heights = self.height.reshape(self.batch, -1).astype(np.float32, copy=False)
+        return np.isfinite(np.vecdot(heights, heights))
 
     @property
     def indentation(self) -> np.ndarray:
@@ -186,8 +201,6 @@ def chosen_envs(envs: ArrayLike | None, batch: int) -> list[int]:
 
 COARSEST_PITCH = 0.1e-3
 """Spacing of the pad's grid where the image does not ask for a finer one [m]."""
-
-
 MOST_CELLS = 8192
 """Most cells of the pad's grid along an axis: the most pixels of an image."""
 _SAME = 1e-6
@@ -215,9 +228,9 @@ def check_grid(gelpad: GelpadSpec, grid: PadGrid) -> None:
     if not np.allclose(ends, expected, rtol=0.0, atol=_SAME):
         rule = f"must be a grid of this sensor's pad, x and y from {expected} m"
         raise InputError("surface.grid", value=ends, rule=rule)
-    off = float(np.abs(grid.rest - rest_height(gelpad, grid.x[None, :], grid.y[:, None])).max())
-    if not off <= _SAME:
-        raise InputError("surface.grid", value=off, rule="must rest on this sensor's dome; its nodes are so far off it [m]")
+    error = float(np.abs(grid.rest - rest_height(gelpad, grid.x[None, :], grid.y[:, None])).max())
+    if not error <= _SAME:
+        raise InputError("surface.grid", value=error, rule="must rest on this sensor's dome; its nodes are so far off it [m]")
 
 
 def make_grid(gelpad: GelpadSpec, pitch: float) -> PadGrid:

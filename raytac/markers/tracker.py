@@ -49,7 +49,10 @@ class MarkerFrame:
 
 
 class _LazyFrame(MarkerFrame):
-    """Markers whose place in space and image, which learners seldom see, is computed if asked."""
+    """Markers whose ``position`` and ``displacement_px``, which learners seldom use, wait.
+
+    They are computed when they are first read.
+    """
 
     def __init__(
         self,
@@ -60,7 +63,7 @@ class _LazyFrame(MarkerFrame):
         position: Callable[[], np.ndarray],
         displacement_px: Callable[[np.ndarray], np.ndarray],
     ) -> None:
-        """``displacement_px``: from positions."""
+        """Keep four fields; ``position`` makes the fifth, and ``displacement_px`` the sixth from it."""
         known = {"displacement": displacement, "rest": rest, "rest_px": rest_px, "visible": visible}
         self.__dict__.update(known, _position=position, _displacement_px=displacement_px)
 
@@ -106,9 +109,11 @@ class MarkerTracker:
         Args:
             sensor: gives the pattern, the camera and, for fitted models, the marker motion.
             markers: name of a marker model, or its configuration.
-            grid: grid of the surfaces to come, of ``num_envs`` environments.
+            grid: grid of the surfaces to come.
+            num_envs: number of environments B.
             resolution: (width, height) of the image that pixels refer to [px]; None is the sensor's own.
             device: ``auto``, ``cpu`` or ``cuda``, for models that can use it.
+            seed: of the perturbations.
 
         Raises:
             InputError: an unknown model, a sensor without markers or without the marker motion that the model needs, or a shift that
@@ -128,26 +133,30 @@ class MarkerTracker:
         self._follows_shear = config.follows_shear
 
     def _place(self, envs: range | list[int]) -> None:
+        """Draw the pattern's placement in environments, where it is perturbed.
+
+        All arrays of the pattern follow from it.
+        """
         moves: dict[str, np.ndarray] = {}
         if self._perturber.settings.moves_pattern:
             for b in envs:
                 self._shift[b], self._turn[b] = self._perturber.placement(b)
             moves = {"shift": self._shift, "turn": self._turn}
         elif hasattr(self, "pattern"):
-            return
+            return  # it never moves
         self.pattern = pattern = MarkerPattern.of(self.sensor, self._resolution, **moves)
         self._rest = pattern.for_batch(self.num_envs)  # one array for every frame, so that models recognise it
         self._pixel = np.broadcast_to(pattern.pixel, (*self._rest.shape[:2], 2))
-        self._all = np.broadcast_to(True, self._rest.shape[:2])
+        self._all_visible = np.broadcast_to(True, self._rest.shape[:2])
         xy = pattern.rest[..., :2]
         self._grid_rest = height_at(GelSurface.at_rest(self.grid), xy.reshape(1, -1, 2)).reshape(xy.shape[:2])
         """z of the grid's rest surface at the pattern [m], (1 or B, M)."""
 
     def reset(self, envs: np.ndarray | list[int] | None = None) -> None:
         """Restart environments, as in ``chosen_envs``: no history, a new placement."""
-        which = chosen_envs(envs, self.num_envs)
-        self._contacts.reset(which)
-        self._place(which)
+        chosen = chosen_envs(envs, self.num_envs)
+        self._contacts.reset(chosen)
+        self._place(chosen)
 
     def reseed(self, envs: Sequence[int], seeds: Sequence[int]) -> None:
         """Restart perturbations, each from a seed; ``reset`` then draws from them."""
@@ -177,24 +186,21 @@ class MarkerTracker:
         count = self.num_envs if envs is None else len(envs)
         if surface.batch != count:
             raise InputError("surface", value=surface.batch, rule=f"must have {count} environments, as this tracker")
-        # The sum of squares is finite if all heights are: many times cheaper than a test of every node. It comes first since it brings
-        # the heights into the cache for the interpolation.
-        heights = surface.height.reshape(count, -1)
-        failed = ~np.isfinite(np.vecdot(heights, heights))
+        failed = ~surface.is_finite  # first, since it brings the heights into the cache for the interpolation
         samples = None if self._cells is None else self._cells.sample(surface)
-        contacts = (
-            None if samples is None else self._contacts.update(surface, samples, envs, shear if self._follows_shear else None)
-        )
+        contacts = None
+        if samples is not None:
+            contacts = self._contacts.update(surface, samples, envs, shear if self._follows_shear else None)
         rest = self._rest if envs is None else self._rest[envs]
-        moved = self.model.displacement(rest, surface, samples, contacts)
-        at_rest = self._grid_rest if envs is None or len(self._grid_rest) == 1 else self._grid_rest[envs]
-        position = np.empty(rest.shape)
-        np.add(rest[..., : moved.shape[-1]], moved, out=position[..., : moved.shape[-1]])
+        displacement = self.model.displacement(rest, surface, samples, contacts)
+        rest_z = self._grid_rest if envs is None or len(self._grid_rest) == 1 else self._grid_rest[envs]
+        position, axes = np.empty(rest.shape), displacement.shape[-1]
+        np.add(rest[..., :axes], displacement, out=position[..., :axes])
 
         def in_space() -> np.ndarray:
-            if moved.shape[-1] == 2:
+            if axes == 2:
                 # Differences of heights come first, so that the displacement of a marker at rest is exactly zero.
-                np.subtract(height_at(surface, position[..., :2]), at_rest, out=position[..., 2])
+                np.subtract(height_at(surface, position[..., :2]), rest_z, out=position[..., 2])
                 position[..., 2] += rest[..., 2]
             return position
 
@@ -208,22 +214,23 @@ class MarkerTracker:
         failed: np.ndarray,
         envs: Sequence[int] | None,
     ) -> MarkerFrame:
-        pixel, all_visible = (values if envs is None else values[envs] for values in (self._pixel, self._all))
+        """Markers as the tracker detects them: with noise and losses; ``displacement`` is changed."""
+        rest_px, all_visible = (values if envs is None else values[envs] for values in (self._pixel, self._all_visible))
         camera, noise = self.pattern.camera, self._perturber.noise(self.pattern.count, envs)
         if noise is not None:
             displacement += noise * np.asarray(self.sensor.camera.pitch_at(camera.resolution))
         visible = self._perturber.visible(self.pattern.count, envs)
-        lost = ([] if visible is None else [~visible]) + ([failed] if failed.any() else [])
+        lost_masks = ([] if visible is None else [~visible]) + ([failed] if failed.any() else [])
 
         def in_image(position: np.ndarray) -> np.ndarray:
             displacement_px = camera.project(position)
-            displacement_px -= pixel
+            displacement_px -= rest_px
             if noise is not None:
                 displacement_px += noise
-            for some in lost:
-                displacement_px[some] = np.nan
+            for mask in lost_masks:
+                displacement_px[mask] = np.nan
             return displacement_px
 
-        for some in lost:
-            displacement[some] = np.nan
-        return _LazyFrame(displacement, rest, pixel, all_visible if visible is None else visible, position, in_image)
+        for mask in lost_masks:
+            displacement[mask] = np.nan
+        return _LazyFrame(displacement, rest, rest_px, all_visible if visible is None else visible, position, in_image)

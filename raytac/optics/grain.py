@@ -13,7 +13,7 @@ from raytac.specs.sensor import NoiseSpec, SensorSpec
 def check_grain(sensor: SensorSpec) -> NoiseSpec:
     """Noise of a sensor whose images shall have grain; InputError if its file gives none."""
     if sensor.noise.is_none:
-        rule = f"the sensor {sensor.name!r} has no noise: give its file a [noise] table, as raytac calibrate writes"
+        rule = f"the sensor {sensor.name!r} has no noise: give its file a [noise] table, as raytac calibrate writes and digit has"
         raise InputError("noise", value=True, rule=rule)
     return sensor.noise
 

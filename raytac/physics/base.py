@@ -16,7 +16,7 @@ from raytac.specs.press import PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
 
 OfSurface = np.ndarray | Callable[[GelSurface], np.ndarray]
-"""An array, or a function that computes it from the surface when it is first asked for."""
+"""An array, or a function that computes it from the surface when it is first read."""
 
 
 class PadReading:
@@ -60,7 +60,10 @@ class PadReading:
         solved: Any = None,
         shear: ContactShear | None = None,
     ) -> None:
-        """Keep what is given (see the class); a function is called on demand, None is not known."""
+        """Keep what the physics knows; arguments as of the class's attributes.
+
+        A function is called when its value is first read; None says that it is not known.
+        """
         self._surface, self._wrench, self._traction, self.has_forces = surface, wrench, traction, wrench is not None
         self.failed = np.zeros(self.surface.batch, bool) if failed is None else failed
         self.unconverged, self.force_law_area = unconverged, force_law_area
@@ -76,7 +79,7 @@ class PadReading:
 
     @cached_property
     def wrench(self) -> np.ndarray:
-        """Force on the pad [N], torque about the frame's origin [N m], (B, 6); NaN if not known."""
+        """Force on the pad [N], torque about the pad's origin [N m], (B, 6); NaN if not known."""
         if self._wrench is None:
             return np.full((len(self.failed), 6), np.nan)
         return self._wrench(self.surface) if callable(self._wrench) else self._wrench
@@ -168,7 +171,7 @@ class PhysicsConfig(Protocol):
     is_simulated: ClassVar[bool]
     """True if a solver has the gel as a mesh.
 
-    Then surfaces have a coat, the device that is asked for is used, and worlds hand over bodies.
+    Then surfaces have a coat, the solver runs on the device that is asked for, and a world's bodies may belong to it.
     """
 
     @property

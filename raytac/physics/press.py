@@ -22,7 +22,7 @@ from raytac.specs.sensor import GelpadSpec, SensorSpec
 
 
 class PressTargets:
-    """Targets of B environments.
+    """Targets of B environments in a press: those given for each, and the scene's elsewhere.
 
     A number that is not finite marks its environment as ``lost``: it fails from the start.
 
@@ -59,30 +59,29 @@ class PressTargets:
         """
         check_whole("num_envs", num_envs, 1, MOST_ENVIRONMENTS)
         given = {
-            "offsets": (offsets, 2),
-            "depths": (depths,),
-            "shears": (shears, 2),
-            "twists": (twists,),
-            "rotations": (rotations, 4),
+            "offsets": (offsets, (num_envs, 2)),
+            "depths": (depths, (num_envs,)),
+            "shears": (shears, (num_envs, 2)),
+            "twists": (twists, (num_envs,)),
+            "rotations": (rotations, (num_envs, 4)),
         }
-        own = {name: check_numbers(name, a, (num_envs, *tail)) for name, (a, *tail) in given.items() if a is not None}
+        own = {name: check_numbers(name, values, shape) for name, (values, shape) in given.items() if values is not None}
         self.lost = np.zeros(num_envs, bool)
         for values in own.values():
             self.lost |= ~np.isfinite(values.reshape(num_envs, -1)).all(axis=1)
         self.offsets, self.depths = own.get("offsets", np.zeros((num_envs, 2))), own.get("depths")
         self._own_targets = {"depth": self.depths, "shear": own.get("shears"), "twist": own.get("twists")}
         identity = np.tile([1.0, 0.0, 0.0, 0.0], (num_envs, 1))
-        turns = np.where(self.lost[:, None], identity, own.get("rotations", identity))
-        zero = ~turns.any(axis=1)
+        quaternions = np.where(self.lost[:, None], identity, own.get("rotations", identity))
+        zero = ~quaternions.any(axis=1)
         if zero.any():
             rule = f"must not be all 0, in environment {int(zero.argmax())}"
-            raise InputError("rotations", value=turns[zero.argmax()].tolist(), rule=rule)
-        at_rest = np.asarray(scene.object.quaternion, float)
-        self._scene, self._turns = scene, turns
-        at_rest = rotation_of(at_rest / np.linalg.norm(at_rest))
-        self.rotations = at_rest[None].repeat(num_envs, axis=0)
+            raise InputError("rotations", value=quaternions[zero.argmax()].tolist(), rule=rule)
+        self._scene, self._quaternions = scene, quaternions
+        scene_rotation = _rotation(np.asarray(scene.object.quaternion, float))
+        self.rotations = scene_rotation[None].repeat(num_envs, axis=0)
         if rotations is not None:
-            self.rotations = np.stack([rotation_of(turn / np.linalg.norm(turn)) for turn in turns]) @ at_rest
+            self.rotations = np.stack([_rotation(quaternion) for quaternion in quaternions]) @ scene_rotation
 
     def stage(self, stage: StageSpec, b: int) -> StageSpec:
         """A stage as environment ``b`` runs it; the scene's own in an environment that is lost."""
@@ -94,15 +93,15 @@ class PressTargets:
         return replace(stage, **{name: tuple(value) if name == "shear" else value})
 
     def depth(self, stage: StageSpec) -> np.ndarray:
-        """Final depth of an indent [m], (B,); 0 in a failed environment."""
+        """Final depth of an indent [m], (B,); 0 in a lost environment."""
         return self._final("depth", stage)
 
     def shear(self, stage: StageSpec) -> np.ndarray:
-        """Final displacement of a shear [m], (B, 2); 0 in a failed environment."""
+        """Final displacement of a shear [m], (B, 2); 0 in a lost environment."""
         return self._final("shear", stage)
 
     def twist(self, stage: StageSpec) -> np.ndarray:
-        """Final angle of a twist [rad], (B,); 0 in a failed environment."""
+        """Final angle of a twist [rad], (B,); 0 in a lost environment."""
         return self._final("twist", stage)
 
     def _final(self, name: str, stage: StageSpec) -> np.ndarray:
@@ -111,33 +110,40 @@ class PressTargets:
         return np.where(self.lost if values.ndim == 1 else self.lost[:, None], 0.0, values)
 
     def start_error(self, b: int, error: InputError) -> InputError | SpecError:
-        """``error`` of environment ``b`` at its start, with its own target's name or the scene's."""
-        own = self._own(b, ())
+        """``error`` of environment ``b`` at its start, with the name of the target that caused it.
+
+        That is a target of its own, or the scene's.
+        """
+        own = self._responsible(b, ())
         if own is not None:
             return InputError(own[0], value=own[1], rule=f"in environment {b}, at the start: {error.rule}")
         place = [float(f"{v * 1e3:.6g}") for v in self._scene.object.position[:2]]
         return SpecError(error.rule, file=self._scene.source, key="object.position_mm", value=place)
 
     def stage_error(self, index: int, stage: StageSpec, b: int, error: InputError) -> InputError | SpecError:
-        """``error`` of environment ``b`` in a stage, with its own target's name or the scene's.
+        """``error`` of environment ``b`` in a stage, with the name of the target that caused it.
+
+        That is a target of its own, or the scene's.
 
         Args:
-            index: the stage's number in the scene, −1 if it is none of the scene's: then ``error`` stays as it is, if nothing is its own.
+            index: the stage's number in the scene, or −1. In a stage that is none of the scene's ``error`` stays as it is, unless a target
+                of the environment's own caused it.
             stage: as environment ``b`` runs it.
             error: of a place (its ``rule`` is a sentence), or of a force or depth (its ``name`` is "force" or "depth [mm]", its rule lacks
                 the subject).
         """
         trajectory = self._scene.trajectory
-        behind = trajectory[: index + 1] if index >= 0 else (*trajectory, stage)
-        own = self._own(b, [one.kind for one in reversed(behind)])
+        stages = trajectory[: index + 1] if index >= 0 else (*trajectory, stage)
+        own = self._responsible(b, [one.kind for one in reversed(stages)])
         noun, unit = error.name.split()[0], {"force": "N", "depth [mm]": "mm"}.get(error.name)
         kept = f"the {noun} kept here, {error.value:.4g} {unit}, " if unit and stage.kind != "indent" else ""
         if error.name == "depth [mm]" and stage.kind == "indent" and self.depths is not None:
             own = "depths [mm]", error.value
         if own is not None:
-            subject = kept or (f"the {noun}, {error.value:.4g} {unit}, " if unit and own[0] != "depths [mm]" else "")
+            name, value = own
+            subject = kept or (f"the {noun}, {error.value:.4g} {unit}, " if unit and name != "depths [mm]" else "")
             where = f"trajectory[{index}]" if index >= 0 else f"a further {stage.kind}"
-            return InputError(own[0], value=own[1], rule=f"in environment {b}, in {where}: {subject}{error.rule}")
+            return InputError(name, value=value, rule=f"in environment {b}, in {where}: {subject}{error.rule}")
         if index < 0:
             return error
         if stage.kind == "shear":
@@ -148,21 +154,29 @@ class PressTargets:
             name, value = {"depth [mm]": "depth_mm"}.get(error.name, "force_n"), error.value
         return SpecError(kept + error.rule, file=self._scene.source, key=f"trajectory[{index}].{name}", value=value)
 
-    def _own(self, b: int, kinds: Iterable[str]) -> tuple[str, object] | None:
-        """Name and value of the target that put environment ``b`` where it is, last stage first."""
+    def _responsible(self, b: int, kinds: Iterable[str]) -> tuple[str, object] | None:
+        """Name and value of the own target that put environment ``b`` where it is; None if none did.
+
+        ``kinds``: of the stages so far, the last one first; before them come its offset and its rotation.
+        """
         for kind in kinds:
             values = self._own_targets.get(kind)
             if values is not None:
                 return f"{kind}s", values[b].tolist()
         if self.offsets[b].any():
             return "offsets", self.offsets[b].tolist()
-        return ("rotations", self._turns[b].tolist()) if self._turns[b, 1:].any() else None
+        return ("rotations", self._quaternions[b].tolist()) if self._quaternions[b, 1:].any() else None
+
+
+def _rotation(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) of a quaternion wxyz of any length but 0."""
+    return rotation_of(quaternion / np.linalg.norm(quaternion))
 
 
 CLEARANCE = 1e-3
 """Height above first touch [m] at which an object waits before a press, after a release."""
 MOST_STEPS = 1_000_000
-"""States that a stage can be asked for."""
+"""Most readings of one stage."""
 
 
 def _check_trajectory(scene: PressScene, gelpad: GelpadSpec, parts: Sequence[Part], depths: np.ndarray | None) -> None:
@@ -251,10 +265,9 @@ class PressPad(ABC):
         gel. ``progress``: a pad that takes long shows a bar on a terminal.
 
         Raises:
-            InputError: ``steps_per_stage`` below 1, or an environment that goes where it cannot by its own offset, rotation, shear or
-                twist; names both.
-            SpecError: a depth or force that would take the object's lowest point past the gel's bonded face, or an object that does not
-                start over the pad or is sheared or twisted off it; names the scene's file and key.
+            InputError: ``steps_per_stage`` below 1. An environment whose own target takes the object off the pad, or past the gel's bonded
+                face; the error names target and environment.
+            SpecError: the same by the scene's own depth, force, place, shear or twist; the error names the scene's file and key.
         """
         check_whole("steps_per_stage", steps_per_stage, 1, MOST_STEPS)
         self._start()
@@ -265,10 +278,9 @@ class PressPad(ABC):
     def follow(self, stage: StageSpec, steps: int = 1) -> Iterator[PadReading]:
         """Readings along one more stage, from wherever the pad is now.
 
-        For a loop that decides step by step where to go next.
-
-        A pad that was not run yet starts above the gel. The readings are of no stage of the scene (their ``stage`` is −1). Nothing moves
-        before the first is asked for; who stops asking leaves the pad where it is then, and may follow another stage from there.
+        It is for a loop that decides step by step where to go next. A pad that was not run yet starts with the object above the gel. The
+        readings are of no stage of the scene (their ``stage`` is −1). The object moves only as readings are taken. After any of them
+        another stage may be followed from there.
 
         Raises:
             InputError: ``steps`` below 1, or a stage that presses deeper than the pad or takes the object off it.

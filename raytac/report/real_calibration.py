@@ -6,7 +6,7 @@ import dataclasses
 import datetime
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -162,7 +162,8 @@ def run_calibrate_optics(
                 if key == "fitted":
                     fitted_errors = np.array([score["contact_mae"] for score in scores])
                 if name == model:  # the held-out ones, where there are some
-                    shown = some, images, circles[chosen], np.array([score["contact_mae"] for score in scores])
+                    errors = np.array([score["contact_mae"] for score in scores])
+                    shown = some, images, circles[chosen], errors, [names[k] for k in index[chosen]]
         metrics |= {f"cost.round_{k}": cost for k, cost in enumerate(fitted.costs)}
         bad = outliers([names[k] for k in index[~is_test]], fitted_errors, fitted.state.circles, train)
         metrics["outliers"] = ", ".join(bad)
@@ -196,16 +197,26 @@ def run_calibrate_optics(
     return [out / name for name in written]
 
 
-def _draw_fit(model: str, shots: Photographs, images: np.ndarray, circles: np.ndarray, errors: np.ndarray, path: Path) -> None:
+def _draw_fit(
+    model: str,
+    shots: Photographs,
+    images: np.ndarray,
+    circles: np.ndarray,
+    errors: np.ndarray,
+    names: Sequence[str],
+    path: Path,
+) -> None:
     """Draw presses from the best to the worst: photograph with its circle, fit, error."""
     order = np.argsort(errors)
     chosen = order[np.unique(np.linspace(0, len(order) - 1, min(_SHOWN, len(order))).round().astype(int))]
-    draw(shots.presses[chosen], [{model: images[k]} for k in chosen], list(circles[chosen]), path)
+    labels = [f"{names[k]}\nerror {errors[k]:.1f}" for k in chosen]
+    draw(shots.presses[chosen], [{model: images[k]} for k in chosen], list(circles[chosen]), path, labels)
 
 
 def calibration_table(metrics: Mapping[str, Metric]) -> str:
-    """Markdown of a fit's errors [levels of 255], from what ``run_calibrate_optics`` wrote."""
-    lines = ["| presses | contact MAE | ring MAE | whole image MAE | PSNR around the contact [dB] |", "|---|---|---|---|---|"]
+    """Markdown of a fit's errors, from what ``run_calibrate_optics`` wrote."""
+    head = "| MAE in levels of 255 | contact MAE | ring MAE | whole image MAE | PSNR around the contact [dB] |"
+    lines = [head, "|---|---|---|---|---|"]
     for key, text in (
         ("fitted", "fitted"),
         ("held_out", "held out"),

@@ -81,7 +81,7 @@ def outliers(names: Sequence[str], errors: np.ndarray, circles: np.ndarray, shot
         if error > OUTLIER * np.median(errors):
             why.append(f"its error in the contact is more than {OUTLIER:g} times the median")
         if moved > limit:
-            why.append(f"its label is {moved:.1f} px from the fitted circle, more than {limit:g}")
+            why.append(f"its circle is {moved:.1f} px from the fitted one, more than {limit:g}")
         if why:
             reasons[name] = " and ".join(why)
     return reasons

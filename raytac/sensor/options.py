@@ -58,10 +58,10 @@ def sensor_outputs(optics: str | OpticsConfig[OpticalMode] | type[OpticsConfig[O
 def checked_outputs(outputs: Sequence[str] | str, optics: OpticsConfig[OpticalMode]) -> tuple[str, ...]:
     """Names in the order of ``OUTPUTS``; ``InputError`` if unknown, or not made by ``optics``."""
     several = outputs if isinstance(outputs, (list, tuple)) else ()
-    given = [outputs] if isinstance(outputs, str) else [name for name in several if isinstance(name, str)]
-    if "markers" in given:
+    names = [outputs] if isinstance(outputs, str) else [name for name in several if isinstance(name, str)]
+    if "markers" in names:
         raise InputError("outputs", value=outputs, rule="markers are asked for by the argument markers, as in markers='fots'")
-    if "force" in given:
+    if "force" in names:
         raise InputError("outputs", value=outputs, rule="frame.force always comes, without asking; 'wrench' adds its torque")
     outputs, offered = check_names("outputs", outputs, OUTPUTS), sensor_outputs(optics)
     for name in outputs:
@@ -125,12 +125,12 @@ def press_scene(scene: str | Path | PressScene) -> PressScene:
 
 def warn_of_other_shape(resolution: tuple[int, int], native: tuple[int, int]) -> None:
     """Warn of an image of another shape than the sensor's view: its pixels are not square."""
-    stretch = (resolution[0] / native[0]) / (resolution[1] / native[1])
+    (width, height), (native_width, native_height) = resolution, native
+    stretch = (width / native_width) / (height / native_height)
     if abs(stretch - 1.0) > SHAPE_TOLERANCE:
-        (width, height), (w, h) = resolution, native
         warnings.warn(
-            f"resolution {width}x{height} squeezes the sensor's view of {w}x{h}: against the sensor's pixels these are "
-            f"{max(stretch, 1 / stretch):.3g} times as {'high as wide' if stretch > 1 else 'wide as high'}; "
-            f"{width}x{max(round(width * h / w), 1)} keeps their shape",
+            f"resolution {width}x{height} squeezes the sensor's view of {native_width}x{native_height}: against the sensor's pixels "
+            f"these are {max(stretch, 1 / stretch):.3g} times as {'high as wide' if stretch > 1 else 'wide as high'}; "
+            f"{width}x{max(round(width * native_height / native_width), 1)} keeps their shape",
             stacklevel=3,
         )

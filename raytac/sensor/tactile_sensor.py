@@ -135,13 +135,17 @@ class TactileSensor:
             MarkerPattern.of(self.spec, self.resolution)  # refuse a pattern outside the view now
         self._tracker: MarkerTracker | None = None
         self._ink: DotInk | None = None
-        wanted = check_truth("noise", noise)
-        self._grain = Grain(self.spec, self.resolution, seed=self.seed, batch=self.num_envs) if wanted else None
+        is_noisy = check_truth("noise", noise)
+        self._grain = Grain(self.spec, self.resolution, seed=self.seed, batch=self.num_envs) if is_noisy else None
         self.optics.check(self.spec)
         self._mode: OpticalMode | None = None
         self._pad: Pad | None = None
-        self._is_narrow = False
-        """True if this press was warned of already."""
+        self._has_warned = False
+        """True once this press was warned of as too narrow for the pad's cells."""
+
+    def __repr__(self) -> str:
+        size, outputs = "{} x {} px".format(*self.resolution), ", ".join(self.outputs)
+        return f"TactileSensor({self.spec.name}, {size}, {self.label}; outputs: {outputs}; environments: {self.num_envs})"
 
     def _repr_html_(self) -> str:
         """Card for notebooks; with the image at rest once a renderer is built."""
@@ -214,26 +218,34 @@ class TactileSensor:
         pitch: float | None = None,
         repair: bool = False,
         progress: bool = False,
-        **own: Unpack[EnvironmentTargets],
+        **targets: Unpack[EnvironmentTargets],
     ) -> TactileFrame:
         """Run the scene's trajectory; frame at its peak: the end of the last stage but a release.
 
-        A mesh (a file or a ``trimesh.Trimesh``) or an array of heights [m] is pressed in to ``depth`` [m] or with ``force`` [N]; a scene
-        that is given one of them is pressed once, so. ``offset`` [m], ``yaw`` and ``tilt`` [rad] place it; these, ``scale``, ``pitch`` and
-        ``repair`` are those of ``raytac.specs.press_of``, and the same in all environments. ``own``: settings by environment, as ``load``
-        takes them. ``progress``: a soft pad, which takes seconds to minutes, shows its stages and the solver's steps in a bar on standard
-        error, elsewhere as lines.
+        Args:
+            scene: name, path or scene, as of ``load``, or an object alone: a mesh (a file or a ``trimesh.Trimesh``) or an array of
+                heights [m].
+            depth: depth of a single indent [m]; an object alone needs this or ``force``. It replaces a scene's own trajectory.
+            force: normal force of that indent [N], instead of ``depth``.
+            offset: place of the object on the pad, x and y [m].
+            yaw, tilt: turn of the object [rad].
+            scale, pitch, repair: of a mesh or of heights, as of ``raytac.specs.press_of``. Like the five before, they are the same in
+                all environments.
+            progress: True shows the stages and the solver's steps of a soft pad, which takes seconds to minutes: a bar on a terminal,
+                else lines, on standard error.
+            targets: targets and seeds of each environment, as of ``load``.
 
         Raises:
             InputError: an argument of ``press_of``, or of ``load``, of the wrong kind or shape, or out of range.
             SpecError: the scene breaks a rule, alone or together with this sensor.
             MeshError: the mesh cannot be used.
         """
-        placed = {"offset": offset, "yaw": yaw, "tilt": tilt}
-        press = press_of(scene, depth=depth, force=force, scale=scale, pitch=pitch, repair=repair, **placed)
+        press = press_of(
+            scene, depth=depth, force=force, offset=offset, yaw=yaw, tilt=tilt, scale=scale, pitch=pitch, repair=repair
+        )
         validate_press(self.spec, press)
         began = time.perf_counter()
-        pad = self.load(press, **own)
+        pad = self.load(press, **targets)
         reading = pad.peak(self._followed(pad.run(progress=progress)))
         physics_ms = 1e3 * (time.perf_counter() - began)
         frame = self.update(reading)
@@ -260,7 +272,7 @@ class TactileSensor:
             rotations: turn of the object about its origin, before the press, axes of the pad frame, wxyz, shape (B, 4).
             shears: target of every ``shear`` stage along x, y [m], shape (B, 2).
             twists: target of every ``twist`` stage [rad], shape (B,).
-            seeds: of the markers' perturbations, one an environment; None goes on with the streams that there are.
+            seeds: of the markers' perturbations and of the images' noise, one an environment; None goes on with the present streams.
 
         Raises:
             InputError: an argument of the wrong shape or out of range.
@@ -271,12 +283,12 @@ class TactileSensor:
         press = press_scene(scene)
         own_seeds = None if seeds is None else check_seeds("seeds", seeds, self.num_envs)
         self._used = scene_physics(self.physics, press)
-        own = TargetArrays(offsets=offsets, depths=depths, rotations=rotations, shears=shears, twists=twists)
-        self._pad = self._used.build(self.spec, press, pitch=self.pitch, num_envs=self.num_envs, device=self.device, **own)
-        self._is_narrow = False
-        if own_seeds is not None and self.markers is not None:
-            self.marker_tracker.reseed(range(self.num_envs), own_seeds)
+        targets = TargetArrays(offsets=offsets, depths=depths, rotations=rotations, shears=shears, twists=twists)
+        self._pad = self._used.build(self.spec, press, pitch=self.pitch, num_envs=self.num_envs, device=self.device, **targets)
+        self._has_warned = False
         if own_seeds is not None:
+            if self.markers is not None:
+                self.marker_tracker.reseed(range(self.num_envs), own_seeds)
             self.reseed_noise(range(self.num_envs), own_seeds)
         if self._tracker is not None:
             self._tracker.reset()
@@ -307,71 +319,73 @@ class TactileSensor:
             self._known_grid = surface.grid
         if envs is not None and len(envs) != surface.batch:
             raise InputError("envs", value=len(envs), rule=f"must name one environment for each of {surface.batch} rows")
-        forces = self._forces(reading)
-        done = time.perf_counter()
-        time_ms = {"surface": 1e3 * (done - began)}
+        forces = self._force_fields(reading)
+        ready = time.perf_counter()
+        time_ms = {"surface": 1e3 * (ready - began)}
         markers = None
         if self.markers is not None:
             markers = self.marker_tracker.update(surface, envs, shear=reading.shear)
-            surface, done = self._dotted(surface, markers), time.perf_counter()
-            time_ms["markers"] = 1e3 * (done - began) - time_ms["surface"]
-        seeds = None if self._grain is None else self._grain.seeds(envs if envs is not None else self._rows(surface))
-        return self._frame(surface, markers, done, time_ms, grain=seeds, **forces)
+            surface, ready = self._dotted(surface, markers), time.perf_counter()
+            time_ms["markers"] = 1e3 * (ready - began) - time_ms["surface"]
+        grain_seeds = None
+        if self._grain is not None:  # a bare surface may have fewer or more rows than there are environments
+            row_envs = envs if envs is not None else [row % self.num_envs for row in range(surface.batch)]
+            grain_seeds = self._grain.seeds(row_envs)
+        return self._frame(surface, markers, ready, time_ms, grain_seeds=grain_seeds, **forces)
 
-    def _rows(self, surface: GelSurface) -> list[int]:
-        """Environments of the rows of a surface, which may have fewer or more of them."""
-        return [row % self.num_envs for row in range(surface.batch)]
-
-    def _forces(self, reading: PadReading) -> dict[str, Any]:
+    def _force_fields(self, reading: PadReading) -> dict[str, Any]:
         """Fields of a frame about forces, as far as they are asked for; none of a bare surface."""
         if not reading.has_forces:
             return {}
         surface, failed = reading.surface, reading.failed
-        outputs: dict[str, Any] = {"force": reading.force, "force_law_area": reading.force_law_area, "failed": failed}
-        outputs["unconverged"] = reading.unconverged
+        fields: dict[str, Any] = {"force": reading.force, "force_law_area": reading.force_law_area, "failed": failed}
+        fields["unconverged"] = reading.unconverged
         if "wrench" in self.outputs:
-            outputs["wrench"] = reading.wrench
+            fields["wrench"] = reading.wrench
         if "traction" in self.outputs:
-            outputs["traction"] = reading.traction()
+            fields["traction"] = reading.traction()
         if {"wrench", "traction"} & set(self.outputs):
             area = cell_areas(surface.grid)
-            outputs["contact_area"] = np.where(failed, np.nan, [float(area[one].sum()) for one in surface.contact])
+            fields["contact_area"] = np.where(failed, np.nan, [float(area[contact].sum()) for contact in surface.contact])
             if surface.coat is not None:
-                outputs["contact_cells"] = np.where(failed, np.nan, cells_across(surface, surface.coat.mesh))
-                self._check_width(reading, outputs["contact_cells"])
-        return outputs
+                fields["contact_cells"] = np.where(failed, np.nan, cells_across(surface, surface.coat.mesh))
+                self._check_width(reading, fields["contact_cells"])
+        return fields
 
-    def _check_width(self, state: PadReading, cells: np.ndarray) -> None:
-        """Warn once a press of a contact too narrow for the pad's cells, as a stage to a depth ends.
+    def _check_width(self, reading: PadReading, cells: np.ndarray) -> None:
+        """Warn once a press if a stage to a depth ends with a contact too narrow for the cells.
 
-        Between the ends of stages every contact is narrow once.
+        While a stage goes on, every contact is narrow for some time.
         """
-        if state.stage < 0:
-            self._is_narrow = False  # a press begins
-        if self._is_narrow or state.fraction < 1.0 or state.stage < 0 or state.scene is None:
+        if reading.stage < 0:
+            self._has_warned = False  # a press begins
             return
-        if not holds_force(state.scene, state.stage):
-            self._is_narrow = warn_if_narrow(cells, getattr(self._used, "level", None), stacklevel=4)
+        if self._has_warned or reading.fraction < 1.0 or reading.scene is None:
+            return
+        if not holds_force(reading.scene, reading.stage):
+            self._has_warned = warn_if_narrow(cells, getattr(self._used, "level", None), stacklevel=4)
 
     def _frame(
         self,
         surface: GelSurface,
         markers: MarkerFrame | None,
-        done: float,
+        ready: float,
         time_ms: dict[str, float],
         *,
-        grain: list[int] | None = None,
+        grain_seeds: list[int] | None = None,
         **fields: Any,
     ) -> TactileFrame:
         """The frame with the images that are asked for.
 
-        ``done``: when the surface was there; ``grain``: seeds of the images' noise, None for none.
+        ``ready``: when surface and markers were ready, by ``time.perf_counter`` [s]; ``grain_seeds``: of the noise in each row's image,
+        None for none.
         """
         fields |= {"height": surface.height if "height" in self.outputs else None, "markers": markers}
         if self._optical_outputs:
             images = start(self.optical_mode, surface)
-            fields["images"] = partial(_by_name, images, None if grain is None else partial(self._with_grain, seeds=grain))
-            time_ms["optics"] = 1e3 * (time.perf_counter() - done)
+            grain = None if self._grain is None or grain_seeds is None else partial(self._grain.added, seeds=grain_seeds)
+            fields["images"] = partial(_image_fields, images, grain)
+            time_ms["optics"] = 1e3 * (time.perf_counter() - ready)
         return TactileFrame(surface, time_ms=time_ms, label=self.label, **fields)  # a mode is named once it is built
 
     def render(
@@ -404,38 +418,38 @@ class TactileSensor:
     def _mapped(
         self, heights: ArrayLike, pitch: float | tuple[float, float] | None, *, overlap: bool, contact: ArrayLike | None
     ) -> GelSurface:
-        """Surface of ``render``."""
-        given = check_maps("heights", heights)
-        step = self.spec.camera.pitch_at(given.shape[:0:-1]) if pitch is None else checked_pitch(pitch)
+        """Gel surface of height maps; arguments and errors as of ``render``."""
+        maps = check_maps("heights", heights)
+        spacing = self.spec.camera.pitch_at(maps.shape[:0:-1]) if pitch is None else checked_pitch(pitch)
         thickness = self.spec.gelpad.thickness
-        if np.abs(given).max() >= thickness or (overlap and given.max() > 0.0):
+        if np.abs(maps).max() >= thickness or (overlap and maps.max() > 0.0):
             rule = f"must be displacements in metres, within the gel's thickness of {thickness:g} m" + overlap * ", and <= 0"
-            raise InputError("heights", value=(float(given.min()), float(given.max())), rule=rule)
-        moved = on_grid(self.grid, given, step)
+            raise InputError("heights", value=(float(maps.min()), float(maps.max())), rule=rule)
+        displacement = on_grid(self.grid, maps, spacing)
         if not overlap:
-            mask = None if contact is None else on_grid(self.grid, check_maps("contact", contact, given.shape), step) >= 0.5
-            return GelSurface.displaced(self.grid, moved, mask)
+            mask = None if contact is None else on_grid(self.grid, check_maps("contact", contact, maps.shape), spacing) >= 0.5
+            return GelSurface.displaced(self.grid, displacement, mask)
         if contact is not None:
             raise InputError("contact", rule="is computed with overlap=True: leave it out")
         surround = ElasticSurround(self.grid, thickness=thickness)
-        surface = surround.surface(np.where(moved < 0.0, self.grid.rest + moved, np.inf))
+        surface = surround.surface(np.where(displacement < 0.0, self.grid.rest + displacement, np.inf))
         if not np.isfinite(surface.height).all():
-            raise InputError("heights", value=float(given.min()), rule="would press the gel below its bonded face")
+            raise InputError("heights", value=float(maps.min()), rule="would press the gel below its bonded face")
         return surface
 
     def rest(self, envs: Sequence[int] = (0,)) -> TactileFrame:
-        """Frame of untouched pads, which difference images start from; markers keep history.
+        """Frame of untouched pads, which difference images start from.
 
-        ``envs``: as in which environments the markers are placed, one row each; all are alike but for a pattern that is shifted or turned.
+        ``envs``: environments, one row each; they differ only where the marker pattern is shifted or turned. The markers' history stays as
+        it is.
         """
-        began, one, markers = time.perf_counter(), GelSurface.at_rest(self.grid), None
-        height, contact, centre = (np.repeat(v, len(envs), axis=0) for v in (one.height, one.contact, one.contact_centre))
-        surface = GelSurface(self.grid, height, contact, centre)
+        began, markers = time.perf_counter(), None
+        surface = GelSurface.at_rest(self.grid).rows([0] * len(envs))
         if self.markers is not None:
             markers = self.marker_tracker.at_rest(envs)
             surface = self._dotted(surface, markers)
-        done = time.perf_counter()
-        return self._frame(surface, markers, done, {"surface": 1e3 * (done - began)})
+        ready = time.perf_counter()
+        return self._frame(surface, markers, ready, {"surface": 1e3 * (ready - began)})
 
     @property
     def marker_tracker(self) -> MarkerTracker:
@@ -493,10 +507,6 @@ class TactileSensor:
         """Underside of the loaded object [m], (B, Ny, Nx), inf beside it; None without an object."""
         return None if self._pad is None else self._pad.object_height(surface)
 
-    def _with_grain(self, rgb: np.ndarray, seeds: list[int]) -> np.ndarray:
-        assert self._grain is not None
-        return self._grain.added(rgb, seeds)
-
     @property
     def optical_mode(self) -> OpticalMode:
         """The renderer, built on first use. Raises as ``OpticsConfig.build``."""
@@ -508,10 +518,10 @@ class TactileSensor:
         return mode
 
 
-def _by_name(images: Callable[[], OpticsImages], seen: Callable[[np.ndarray], np.ndarray] | None = None) -> dict[str, Any]:
-    """Fields of a frame from images that are waited for; ``seen`` makes ``rgb`` the camera's."""
-    known = images()
-    fields = {name: getattr(known, name, None) for name in IMAGES}
-    if seen is not None and fields["rgb"] is not None:
-        fields["rgb"] = seen(fields["rgb"])
+def _image_fields(images: Callable[[], OpticsImages], grain: Callable[[np.ndarray], np.ndarray] | None) -> dict[str, Any]:
+    """Wait for ``images``: fields of a frame by name; ``grain`` adds noise to ``rgb``."""
+    rendered = images()
+    fields = {name: getattr(rendered, name, None) for name in IMAGES}
+    if grain is not None and fields["rgb"] is not None:
+        fields["rgb"] = grain(fields["rgb"])
     return fields

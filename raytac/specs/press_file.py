@@ -21,6 +21,9 @@ from raytac.specs.toml import Table, Text, in_mm, read_toml
 
 _KIND = "kind"
 _UNTURNED = (1.0, 0.0, 0.0, 0.0)
+_HIGHEST = 0.1
+"""Greatest height of a map that is pressed [m]; a larger one is in other units."""
+_MAP_IN_PYTHON = "a height map is pressed in Python: sensor.press(heights, pitch=..., depth=...), all in metres"
 
 
 def load_press(name_or_path: str | Path) -> PressScene:
@@ -89,9 +92,9 @@ def press_of(
         repair: close the holes of a mesh, as ``load_mesh`` does.
 
     Raises:
-        InputError: an argument that is missing, out of range, or that belongs to another kind of source; heights that are not finite,
-            negative, or all 0.
-        SpecError: a depth or force out of range; as ``load_press``.
+        InputError: an argument that is missing, out of range, or that belongs to another kind of source; a file of another kind;
+            heights that are not finite, negative, all 0, or above 0.1 m.
+        SpecError: a force out of range; as ``load_press``.
         MeshError: as ``load_mesh``.
     """
     place = check_numbers("offset", offset, (2,), finite=True)
@@ -109,11 +112,16 @@ def press_of(
     ):
         if value is not None and not belongs:
             raise InputError(name, value=value, rule=f"belongs to {owner}: leave it out with a {'mesh' if is_mesh else 'scene'}")
+    if isinstance(source, (str, Path)) and not is_file and Path(source).suffix.lower() not in ("", ".toml"):
+        rule = f"must be the name of a press scene, a .toml file or a mesh ({', '.join(MESH_SUFFIXES)}); {_MAP_IN_PYTHON}"
+        raise InputError("scene", value=str(source), rule=rule)
     if depth is not None and force is not None:
         raise InputError("depth, force", value=(depth, force), rule="cannot both be given: a press ends at one of them")
     if depth is None and force is None and (is_mesh or is_map):
         how = "raytac press FILE --depth 0.8 (mm) or --force 2 (N), in Python depth=0.8e-3 (m) or force=2.0 (N)"
-        raise InputError("depth", rule=f"must be given with a mesh or a height map, or force: {how}")
+        raise InputError("depth, force", rule=f"one of the two must be given with a mesh or a height map: {how}")
+    if depth is not None:
+        check_number("depth", depth, "(0, 0.05]", "m (0.8e-3 is 0.8 mm; --depth takes mm)")
     if is_mesh:
         scene = _mesh_scene(source, scale, repair=bool(repair))
     elif isinstance(source, np.ndarray):
@@ -172,6 +180,8 @@ def _heights_object(source: np.ndarray, pitch: float | None) -> ObjectSpec:
     heights = check_numbers("heights", source, (None, None), finite=True)
     if not heights.size or heights.min() < 0 or heights.max() == 0:
         raise InputError("heights", value=heights.shape, rule="must be >= 0 everywhere and > 0 somewhere [m]")
+    if heights.max() > _HIGHEST:
+        raise InputError("heights", value=float(heights.max()), rule=f"must be in metres, at most {_HIGHEST} m")
     params: dict[str, float | int | str] = {"pitch": check_number("pitch", pitch, "(0, 0.01]", "m")}
     return ObjectSpec("heights", params, (0.0, 0.0, 0.0), _UNTURNED, 0.1, heights=tuple(map(tuple, heights.tolist())))
 

@@ -102,7 +102,7 @@ class SweepSpec:
     name: str
     sensors: tuple[SensorSpec, ...]
     objects: tuple[PressScene, ...]
-    """Press scenes whose objects are pressed; their own trajectories are not used."""
+    """Press scenes, or meshes, whose objects are pressed; trajectories are not used."""
     count: int
     ranges: PressRanges
     shard_size: int = 256

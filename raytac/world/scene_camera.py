@@ -13,14 +13,16 @@ from raytac.world.world import TactileWorld
 _SHARP = 2
 """Samples of a pixel along each side."""
 _SHADOWS = 2048
-"""Texels along a side of the map of shadows: what a CPU draws quickly."""
+"""Texels along a side of the map of shadows; a CPU still draws it quickly."""
 _SKY = np.array((238.0, 241.0, 245.0), np.float32)
 """Colour of the background: one, since a GIF has few."""
 _FLOOR, _LINES = (0.83, 0.84, 0.85, 1.0), (0.70, 0.71, 0.73, 1.0)
-_TILE, _REACH, _LINE = 0.1, 1.2, 0.8e-3
-"""Spacing of a floor's lines, their reach from the centre, and half their width [m]."""
-_AWAY = np.array([-0.35, 0.45, 1.0])
-"""Direction to the lamp: to the right of the eye, towards it, and up."""
+_TILE, _REACH = 0.1, 1.2
+"""Spacing of a floor's lines, and their reach from the centre [m]."""
+_LINE, _LIFT = 0.8e-3, 0.2e-3
+"""Half the width of these lines, and their height over the floor [m]."""
+_TO_LAMP = np.array([-0.35, 0.45, 1.0])
+"""Direction to the lamp; its components are to the right of the picture, to the eye, and up."""
 _LAMP = 1.6
 """Distance of the lamp from the centre of the picture [m]."""
 _BALL = 4e-3
@@ -31,8 +33,8 @@ _GREEN = np.array([0.1, 0.7, 0.2, 0.8], np.float32)
 class SceneCamera:
     """Camera at a fixed pose in every environment of a world.
 
-    A scene without lamps of its own gets one that casts shadows, and its floor a grid of 0.1 m; nothing of it is in the model.
-    Needs OpenGL without a display: MuJoCo reads the environment variable ``MUJOCO_GL`` (``egl`` or ``osmesa``) when it is imported.
+    A scene without lamps of its own gets one that casts shadows, and its floor a grid of 0.1 m; neither is in the model. It needs OpenGL
+    without a display: MuJoCo reads the environment variable ``MUJOCO_GL`` (``egl`` or ``osmesa``) when it is imported.
     Soft pads are not drawn, since MuJoCo does not have their gel.
     """
 
@@ -98,18 +100,22 @@ class SceneCamera:
             self._hang_lamp()
         width, height = self.resolution
         picture = self._renderer.render().astype(np.float32)
-        nothing = (picture == 0.0).all(axis=2, keepdims=True)  # where no geom is: MuJoCo leaves it black
-        picture = np.where(nothing, _SKY, picture)
+        is_empty = (picture == 0.0).all(axis=2, keepdims=True)  # MuJoCo leaves black what no geom covers
+        picture = np.where(is_empty, _SKY, picture)
         return np.rint(picture.reshape(height, _SHARP, width, _SHARP, 3).mean(axis=(1, 3))).astype(np.uint8)
 
     def _add(self, kind: mujoco.mjtGeom, size: np.ndarray, at: np.ndarray, turn: np.ndarray, colour: np.ndarray) -> None:
+        """Add a geom at a position [m] and a rotation (3, 3), if MuJoCo has room for it."""
         scene = self._renderer.scene
         if scene.ngeom < scene.maxgeom:
             mujoco.mjv_initGeom(scene.geoms[scene.ngeom], kind, size, at, turn.ravel(), colour)
             scene.ngeom += 1
 
     def _lay_floor(self) -> None:
-        """Planes without a texture in a light grey, with a grid around the centre of the picture."""
+        """Planes without a texture in a light grey, with a grid around the centre of the picture.
+
+        Lines are planes too: boxes that thin would lie in their own shadow here and there.
+        """
         scene, plane = self._renderer.scene, mujoco.mjtGeom.mjGEOM_PLANE
         for geom in [scene.geoms[k] for k in range(scene.ngeom) if scene.geoms[k].type == plane and scene.geoms[k].matid < 0]:
             geom.rgba[:], turn, at = _FLOOR, geom.mat.copy(), geom.pos.copy()
@@ -120,19 +126,19 @@ class SceneCamera:
                 for line in np.arange(-_REACH, _REACH + 0.5 * _TILE, _TILE) + middle[axis]:
                     if abs(line) > edge[axis] or span[1] <= span[0]:
                         continue
-                    place, size = np.zeros(3), np.full(3, 0.1e-3)
+                    place, size = np.full(3, _LIFT), np.full(3, _TILE)
                     place[axis], place[1 - axis], size[axis], size[1 - axis] = line, span.mean(), _LINE, 0.5 * np.ptp(span)
-                    self._add(mujoco.mjtGeom.mjGEOM_BOX, size, at + turn @ place, turn, np.array(_LINES, np.float32))
+                    self._add(plane, size, at + turn @ place, turn, np.array(_LINES, np.float32))
 
     def _hang_lamp(self) -> None:
-        """One lamp over the camera's shoulder, whose shadows fall to the side."""
+        """One lamp over the camera's left shoulder, so that shadows fall to the right and back."""
         scene, azimuth = self._renderer.scene, np.radians(self._camera.azimuth)
-        along = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        right, up = np.array([along[1], -along[0], 0.0]), np.array([0.0, 0.0, 1.0])
-        away = _AWAY[0] * right - _AWAY[1] * along + _AWAY[2] * up
-        away *= _LAMP / np.linalg.norm(away)
+        forward = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        right, up = np.array([forward[1], -forward[0], 0.0]), np.array([0.0, 0.0, 1.0])
+        to_lamp = _TO_LAMP[0] * right - _TO_LAMP[1] * forward + _TO_LAMP[2] * up
+        to_lamp /= np.linalg.norm(to_lamp)
         lamp = scene.lights[scene.nlight]
-        lamp.pos[:], lamp.dir[:] = self._camera.lookat + away, -away / _LAMP
+        lamp.pos[:], lamp.dir[:] = self._camera.lookat + _LAMP * to_lamp, -to_lamp
         lamp.type, lamp.headlight, lamp.castshadow = int(mujoco.mjtLightType.mjLIGHT_DIRECTIONAL), 0, 1
         lamp.attenuation[:] = 1.0, 0.0, 0.0
         lamp.ambient[:], lamp.diffuse[:], lamp.specular[:] = 0.0, 0.5, 0.15

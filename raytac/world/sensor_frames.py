@@ -38,6 +38,7 @@ class SensorFrames:
         self._mounted, self._num_envs, self._seed = tuple(mounted), num_envs, seed
         self._settings: dict[str, Any] = {**settings, "physics": physics}
         self._made: dict[str, TactileSensor] = {}
+        self._has_warned = False
         with warnings.catch_warnings(action="ignore"):  # the sensors that are kept warn
             for one in self._mounted:  # pads alone may run on a device that cannot trace rays
                 TactileSensor(one.spec, **{"seed": seed, "num_envs": num_envs, **self._settings, "device": "cpu"})
@@ -67,7 +68,7 @@ class SensorFrames:
     ) -> dict[str, TactileFrame]:
         """Frames of the sensors named (None: all) in ``envs`` (mask (B,), list, None for all).
 
-        Environments whose surface cannot be are marked in ``failed`` (B,).
+        Environments whose surface cannot be are marked in ``failed`` (B,); a ``RuntimeWarning`` says so the first time.
 
         Raises ``InputError``: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
         """
@@ -84,4 +85,9 @@ class SensorFrames:
             reading = read(name, sensor.grid, rows)
             failed[slice(None) if rows is None else rows] |= reading.failed
             frames[name] = sensor.update(reading, rows)
+            if reading.failed.any() and not self._has_warned:
+                self._has_warned = True
+                env = int((range(self._num_envs) if rows is None else rows)[int(reading.failed.argmax())])
+                text = "its state is not finite, or a body lies beyond the bonded face of a gel; its values are NaN until it is reset"
+                warnings.warn(f"environment {env} failed, as frame.failed says: {text}", RuntimeWarning, stacklevel=3)
         return frames

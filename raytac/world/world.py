@@ -138,18 +138,15 @@ class TactileWorld:
         self.engine = checked_engine(engine)
         if coupling is not None:
             check_known("coupling", coupling, COUPLINGS)
-        own = {"sensors": sensors, "touches": touches, "control_timestep": control_timestep, "keyframe": keyframe}
-        own["allow_overlap"] = allow_overlap or None
         is_own = isinstance(scene, (mujoco.MjSpec, mujoco.MjModel))
-        if not isinstance(scene, (str, Path, TaskScene, mujoco.MjSpec, mujoco.MjModel)):
-            rule = "must be a task scene, its name or path, a mujoco.MjSpec or a mujoco.MjModel"
-            raise InputError("scene", value=type(scene).__name__, rule=rule)
-        if isinstance(scene, (str, Path)) and Path(scene).suffix.lower() in (".xml", ".mjcf", ".urdf", ".mjb"):
-            rule = "is no task scene: give a MuJoCo model as mujoco.MjSpec.from_file(path), with sensors by raytac.mount"
-            raise InputError("scene", value=scene, rule=rule)
-        for given, value in own.items():
-            if value is not None and not is_own:
-                raise InputError(given, value=value, rule="is for a MjSpec or MjModel: a task scene says this itself")
+        _check_scene(
+            scene,
+            sensors=sensors,
+            touches=touches,
+            control_timestep=control_timestep,
+            keyframe=keyframe,
+            allow_overlap=allow_overlap or None,
+        )
         self.scene = None if is_own else scene if isinstance(scene, TaskScene) else load_task(scene)
         self.physics = (asked or PHYSICS.config("rigid")) if self.scene is None else scene_physics(asked, self.scene)
         name = PHYSICS.name_of(self.physics)
@@ -168,7 +165,14 @@ class TactileWorld:
         if isinstance(scene, (mujoco.MjSpec, mujoco.MjModel)):
             model = copy(compiled_model(scene))
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-            self.composed = own_world_model(model, **{**own, "allow_overlap": allow_overlap})
+            self.composed = own_world_model(
+                model,
+                sensors=sensors,
+                touches=touches,
+                control_timestep=control_timestep,
+                keyframe=keyframe,
+                allow_overlap=allow_overlap,
+            )
         else:
             assert self.scene is not None
             self.composed = compose(self.scene, "ipc" if self.physics.is_simulated else "rigid")
@@ -188,25 +192,30 @@ class TactileWorld:
         self._markers = None if markers is None else markers_config(markers)
         self.model = self.composed.model
         self.arm: Arm | None = self.composed.arm
-        if isinstance(self.engine, WarpEngine) and isinstance(self.physics, Ipc):
+        needs_height = markers is not None or "height" in ((outputs,) if isinstance(outputs, str) else outputs)
+        self._states = self._make_states(needs_height=needs_height)
+        self.models, self._pads = self._states.models, self._states.pads
+        self._step_lock = Lock()
+        check_start(self.composed, self._states.first(), self._pads.overlap(0))
+
+    def _make_states(self, *, needs_height: bool) -> CStates | WarpStates | WarpSoftStates:
+        """States of all environments and their pads, by engine and physics.
+
+        ``needs_height``: gel surfaces are read on the device; only MuJoCo Warp with rigid pads prepares that.
+        """
+        engine, physics = self.engine, self.physics
+        if engine is None:
+            pad_class = WORLD_PADS.config_class(PHYSICS.name_of(physics))
+            pads = partial(pad_class, physics=physics, coupling=self.coupling, device=self.device)
+            return CStates(self.composed, self.num_envs, pads)
+        if isinstance(physics, Ipc):
             from raytac.world.warp_soft_states import WarpSoftStates
 
-            soft = {"physics": self.physics, "coupling": self.coupling}
-            self._states: CStates | WarpStates | WarpSoftStates = WarpSoftStates(
-                self.composed, num_envs, self.engine, device, **soft
-            )
-        elif isinstance(self.engine, WarpEngine):
-            from raytac.world.warp_states import WarpStates
+            return WarpSoftStates(self.composed, self.num_envs, engine, self.device, physics=physics, coupling=self.coupling)
+        from raytac.world.warp_states import WarpStates
 
-            felt = "height" in ((outputs,) if isinstance(outputs, str) else outputs) or markers is not None
-            grids = {one: sensor.grid for one, sensor in self._frames.sensors.items()} if felt else {}
-            self._states = WarpStates(self.composed, num_envs, self.engine, device, grids=grids, markers=self._markers)
-        else:
-            pads = partial(WORLD_PADS.config_class(name), physics=self.physics, coupling=self.coupling, device=device)
-            self._states = CStates(self.composed, num_envs, pads)
-        self.models, self._pads = self._states.models, self._states.pads
-        self._stepped = Lock()
-        check_start(self.composed, self._states.first(), self._pads.overlap(0))
+        grids = {name: sensor.grid for name, sensor in self._frames.sensors.items()} if needs_height else {}
+        return WarpStates(self.composed, self.num_envs, engine, self.device, grids=grids, markers=self._markers)
 
     def __repr__(self) -> str:
         name, sensors = "own model" if self.scene is None else repr(self.scene.name), ", ".join(self.sensor_names)
@@ -296,10 +305,10 @@ class TactileWorld:
         starts = {
             name: self._checked_start(f"bodies[{name!r}]", poses, (len(chosen), 4, 4)) for name, poses in (bodies or {}).items()
         }
-        free = [name for name, body in self.composed.bodies.items() if body.is_placed]
+        placed = [name for name, body in self.composed.bodies.items() if body.is_placed]
         for name in starts:
-            if name not in free:
-                raise InputError("bodies", value=name, rule="must be the name of a free rigid body", choices=free)
+            if name not in placed:
+                raise InputError("bodies", value=name, rule="must be the name of a free rigid body", choices=placed)
             rigid_poses(f"bodies[{name!r}]", starts[name], len(chosen))
         if joints is not None:
             joints = self._checked_start("joints", joints, (len(chosen), 0 if self.arm is None else len(self.arm)))
@@ -335,19 +344,19 @@ class TactileWorld:
             control: controllers of the actuators (see ``Control``); None is ``hold``.
 
         Raises:
-            InputError: another thread steps this world, MuJoCo's timestep or cone were changed, controls of the wrong shape or number, or
-                not finite; with soft pads, a motion too fast to be resolved near a
-                contact, in the only environment, which has failed then. Of several environments the one that moves so fast is marked in
-                ``failed``, with a ``RuntimeWarning``.
+            InputError: another thread steps this world, MuJoCo's timestep or cone were changed, or controls of the wrong shape or number,
+                or not finite. With soft pads also a motion near a contact that is too fast to be resolved, if there is one environment,
+                which has failed then. Of several environments the one that moves so fast is marked in ``failed``, with a
+                ``RuntimeWarning``.
         """
         holding = control is None or (callable(control) and control == self.hold)
-        if not self._stepped.acquire(blocking=False):
+        if not self._step_lock.acquire(blocking=False):
             rule = "must be stepped by one thread at a time; each thread may have a world of its own"
             raise InputError("world", value="stepped by another thread", rule=rule)
         try:
             self._states.step(None if holding else control)
         finally:
-            self._stepped.release()
+            self._step_lock.release()
         return self.state()
 
     @property
@@ -361,26 +370,26 @@ class TactileWorld:
 
     def state(self) -> WorldState:
         """Present state of all environments."""
-        now, lost = self._states.values(), self._states.failed
+        values, failed = self._states.values(), self._states.failed
         wrench = {name: self._pads.wrench(name) for name in self.sensor_names}
-        time = now.pop("time")
-        if lost.any():
-            for values in (*now.values(), *wrench.values()):
-                values[lost] = np.nan
-        pads = {name: now[f"pad {name}"] for name in self.sensor_names}
-        bodies = {name: now[f"body {name}"] for name in self.composed.bodies}
-        return WorldState(time, now.get("joints"), pads, bodies, wrench, lost.copy(), dict(self._pads.report))
+        time = values.pop("time")
+        if failed.any():
+            for array in (*values.values(), *wrench.values()):
+                array[failed] = np.nan
+        pads = {name: values[f"pad {name}"] for name in self.sensor_names}
+        bodies = {name: values[f"body {name}"] for name in self.composed.bodies}
+        return WorldState(time, values.get("joints"), pads, bodies, wrench, failed.copy(), dict(self._pads.report))
 
     def observe(
         self, sensors: Sequence[str] | str | None = None, envs: np.ndarray | list[int] | None = None
     ) -> dict[str, TactileFrame]:
         """Frames of the sensors named (all if None), of all environments at once.
 
-        Images and markers are computed here.
-        Markers that depend on a contact's history (``fots``) use only the states that are observed: observe them in every control step.
+        Images and markers are computed here. Markers that depend on a contact's history (``fots``) use only the states that are observed:
+        observe them in every control step.
 
-        ``envs`` (a mask (B,) or a list) gives frames with one row for each environment named. For the others no noise is drawn and no
-        history is written. One that is named twice has two equal rows.
+        ``envs`` (a mask (B,) or a list) gives frames with one row for each environment named; one that is named twice has two equal rows.
+        For the others no noise is drawn and no history is written.
 
         Raises ``InputError``: an unknown sensor or environment, or no environment at all; as ``TactileSensor.update``.
         """
@@ -405,12 +414,12 @@ class TactileWorld:
             raise InputError("sensor", value=name, rule="must be a sensor of the world", choices=self.sensor_names)
         if self._pads.soft is None:
             return self._states.read(name)
-        sensor, pads, places = self._frames.sensors[name], cast("SoftPads", self._pads), None
+        sensor, pads, marker_rest = self._frames.sensors[name], cast("SoftPads", self._pads), None
         if isinstance(self._markers, SurfaceMarkers):
             if self._markers.perturbation is not None:
                 raise InputError("perturbation", value=self._markers.perturbation, rule="must be None on the device")
-            places = MarkerPattern.of(sensor.spec).rest[0, :, :2]
-        return pads.arrays(name, sensor.grid, self._states.failed.copy(), places)
+            marker_rest = MarkerPattern.of(sensor.spec).rest[0, :, :2]
+        return pads.arrays(name, sensor.grid, self._states.failed.copy(), marker_rest)
 
     def mesh(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Present surface of a body or soft pad: vertices (B, n, 3) [m], world, and faces (F, 3).
@@ -421,12 +430,30 @@ class TactileWorld:
             return self._pads.soft.mesh(name)
         body = self.composed.bodies.get(name)
         if body is None or body.is_plane:
-            there = [n for n, b in self.composed.bodies.items() if not b.is_plane]
-            there += self._pads.meshes
+            bounded = [n for n, b in self.composed.bodies.items() if not b.is_plane]
+            bounded += self._pads.meshes
             rule = "must be the name of a body or a soft pad, and no half-space"
-            raise InputError("name", value=name, rule=rule, choices=list(dict.fromkeys(there)))
+            raise InputError("name", value=name, rule=rule, choices=list(dict.fromkeys(bounded)))
         from raytac.shapes.triangulate import object_surface
 
         surface = object_surface(body.parts)
         poses = self.state().world_from_body[name]
         return np.einsum("bij,nj->bni", poses[:, :3, :3], surface.vertices) + poses[:, None, :3, 3], surface.faces
+
+
+def _check_scene(scene: object, **of_model: object) -> None:
+    """Raise ``InputError`` for what is no scene, or a file of another kind.
+
+    ``of_model``: arguments that only a MuJoCo model takes, by name; with a task scene they must be None.
+    """
+    if not isinstance(scene, (str, Path, TaskScene, mujoco.MjSpec, mujoco.MjModel)):
+        rule = "must be a task scene, its name or path, a mujoco.MjSpec or a mujoco.MjModel"
+        raise InputError("scene", value=type(scene).__name__, rule=rule)
+    if isinstance(scene, (str, Path)) and Path(scene).suffix.lower() in (".xml", ".mjcf", ".urdf", ".mjb"):
+        rule = "is no task scene: give a MuJoCo model as mujoco.MjSpec.from_file(path), with sensors by raytac.mount"
+        raise InputError("scene", value=scene, rule=rule)
+    if isinstance(scene, (mujoco.MjSpec, mujoco.MjModel)):
+        return
+    for name, value in of_model.items():
+        if value is not None:
+            raise InputError(name, value=value, rule="is for a MjSpec or MjModel: a task scene says this itself")

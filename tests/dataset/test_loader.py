@@ -368,6 +368,8 @@ def test_a_contact_sheet_says_what_each_press_is_and_how_deep_with_a_scale(folde
 
 
 def test_a_card_for_notebooks_shows_the_first_presses(folders: dict[bool, Path]) -> None:
+    data = PressDataset(folders[False], ("height", "press_depth"))
+    assert repr(data) == f"PressDataset({str(folders[False])!r}, {len(data)} presses; height, press_depth)"
     page = PressDataset(folders[False])._repr_html_()
     assert (
         page.count("data:image/png;base64,") == min(len(PressDataset(folders[False])), 6) and "without those that failed" in page

@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from raytac.envs import RollBallVectorEnv
+from raytac.envs import ProcessVectorEnv, RollBallVectorEnv
 from raytac.errors import InputError
 from raytac.observe import ObservationSettings, TactileObserver
 from raytac.observe.wrapper import AddTactile
@@ -29,11 +29,10 @@ from experiments.imitation import imitate, regress
 from experiments.ppo_learner import SMALLEST_SIDE, Checkpoint, Learner, Recipe, evaluate_learner, tactile_settings
 from experiments.ppo_training import Training
 from raytac.envs.roll_ball import RollBall
-from raytac.envs.sb3 import ProcessVecEnv, TactileVecEnv
-from tests.envs.seeds import Seeds
+from raytac.envs.sb3 import TactileVecEnv
 
 
-def played(env: TactileVecEnv | ProcessVecEnv, steps: int) -> list[tuple]:
+def played(env: TactileVecEnv, steps: int) -> list[tuple]:
     env.seed(3)
     first = {name: values.copy() for name, values in env.reset().items()}
     rng = np.random.default_rng(0)
@@ -60,7 +59,7 @@ def test_it_is_the_vector_and_so_are_processes_of_it() -> None:
     first, _ = plain.reset(seed=3)
     alone, spread = (
         TactileVecEnv(RollBallVectorEnv(2, **options)),
-        ProcessVecEnv(RollBallVectorEnv, num_envs=2, processes=2, **options),
+        TactileVecEnv(ProcessVectorEnv(RollBallVectorEnv, 2, processes=2, **options)),
     )
     try:
         one, two = played(alone, 4), played(spread, 4)
@@ -86,33 +85,7 @@ def test_it_is_the_vector_and_so_are_processes_of_it() -> None:
     assert ended == 2
 
 
-def test_no_two_environments_of_processes_have_the_same_seed() -> None:
-    env = ProcessVecEnv(Seeds, num_envs=6, processes=2, seed=5)  # type: ignore[arg-type]
-    try:
-        assert env.reset()["seed"].tolist() == [5, 6, 7, 8, 9, 10]
-    finally:
-        env.close()
-
-
-def test_bad_input_comes_back_from_a_process() -> None:
-    with pytest.raises(InputError, match="multiple of the number of processes"):
-        ProcessVecEnv(RollBallVectorEnv, num_envs=3, processes=2)
-    with pytest.raises(InputError, match="modalities = 'taste': must be a known name"):
-        ProcessVecEnv(RollBallVectorEnv, num_envs=2, processes=1, tactile=("taste",))
-    env = ProcessVecEnv(RollBallVectorEnv, num_envs=2, processes=2, tactile=None)
-    try:
-        env.reset()
-        actions = np.zeros((2, 3))
-        actions[1, 2] = np.nan
-        with pytest.raises(InputError, match="environment 1"):
-            env.step(actions)
-        actions[1, 2] = 2.0
-        with pytest.raises(InputError, match="must be finite and in") as caught:
-            env.step(actions)
-        assert "environments 1 to 1, in process 1" in caught.value.__notes__[0]
-        assert env.step(np.zeros((2, 3)))[1].shape == (2,), "it goes on after a refused step"
-    finally:
-        env.close()
+def test_bad_input() -> None:
     with pytest.raises(InputError, match="SameStep"):
         TactileVecEnv(RollBallVectorEnv(1, tactile=None, autoreset_mode="NextStep"))
 

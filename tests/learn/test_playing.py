@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -66,21 +67,13 @@ def test_shipped_policies_fit_their_environments() -> None:
 
 @pytest.mark.renderer
 def test_a_shipped_policy_is_filmed_by_name(tmp_path: Path) -> None:
-    """In a process of its own: the GL backend is chosen when MuJoCo is imported."""
+    """In a process of its own: the GL backend is chosen when MuJoCo is imported. An episode is cut to 0.9 s, since frames take long."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    command = [
-        sys.executable,
-        "-m",
-        "raytac",
-        "play",
-        "push_cube_ppo",
-        "--episodes",
-        "1",
-        "--optics",
-        "phong",
-        "--out",
-        str(tmp_path),
-    ]
+    code = (
+        "import sys; from raytac.envs.push_cube import PushCube; PushCube.max_episode_steps = 45; from raytac.cli import main; "
+    )
+    options = ["play", "push_cube_ppo", "--episodes", "1", "--optics", "phong", "--out", str(tmp_path)]
+    command = [sys.executable, "-c", code + "sys.exit(main(sys.argv[1:]))", *options]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=250)
     assert done.returncode == 0, done.stderr
     read = read_metrics(tmp_path / "metrics.json")
@@ -90,7 +83,7 @@ def test_a_shipped_policy_is_filmed_by_name(tmp_path: Path) -> None:
     from PIL import Image
 
     with Image.open(tmp_path / "film.gif") as film:
-        assert film.n_frames > 5 and film.size[0] > film.size[1]  # type: ignore[attr-defined]
+        assert film.n_frames == 15 and film.size[0] > film.size[1]  # type: ignore[attr-defined]
         first = np.asarray(film.convert("RGB"), float)
         film.seek(film.n_frames - 1)  # type: ignore[attr-defined]
         assert np.abs(np.asarray(film.convert("RGB"), float) - first).mean() > 1.0
@@ -101,6 +94,21 @@ def test_a_shipped_policy_is_filmed_by_name(tmp_path: Path) -> None:
 def test_a_gif_ends_with_the_last_picture(count: int) -> None:
     shown = [int(picture) for picture in gif_pictures([np.array(k) for k in range(count)])]
     assert shown[-1] == count - 1 and shown[0] < 3 and set(np.diff(shown)) <= {3}
+
+
+def test_the_script_of_a_checkout_plays_files_of_both_trainings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By what is in the file: those of ``raytac train`` without PyTorch, which the other reader imports."""
+    from experiments import play
+
+    found = play.main(
+        play.Args(checkpoint=shipped_policies()["balance_pole_ppo"], episodes=1, num_envs=1, film=False, out=tmp_path)
+    )
+    assert (found["task"], found["policy"], found["episodes"]) == ("BalancePole", "balance_pole_ppo", 1)
+    monkeypatch.setitem(sys.modules, "experiments.ppo_learner", SimpleNamespace(CheckpointPlayer=lambda path: path))
+    theirs = Path(__file__).parents[2] / "experiments" / "policies" / "balance_pole_wrench.pt"
+    assert play.player_of(theirs) == theirs
+    with pytest.raises(InputError, match=r"is a checkpoint of train_ppo\.py.*experiments/play\.py"):
+        find_player(str(theirs))
 
 
 def test_bad_input(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Ray tracers are built once a session: a build compiles kernels and Mitsuba scenes."""
+"""Ray tracers are built once: a build compiles kernels and Mitsuba scenes."""
 
 from __future__ import annotations
 
@@ -15,12 +15,23 @@ Build = Callable[..., Any]
 
 
 @pytest.fixture(scope="session")
-def tracer() -> Build:
-    """``tracer(spec, **options)``: a ray tracer on the CPU, the same object for the same arguments (hence: one grid for each)."""
-    built: dict[Any, Any] = {}
+def without_scene() -> dict[Any, Any]:
+    """Tracers of the session by their arguments: those of ``fast``, which hold no Mitsuba scene."""
+    return {}
+
+
+@pytest.fixture(scope="module")
+def tracer(without_scene: dict[Any, Any]) -> Build:
+    """``tracer(spec, **options)``: a ray tracer on the CPU, the same object for the same arguments (hence: one grid for each).
+
+    Tracers with a Mitsuba scene are those of one file. Dr.Jit's virtual calls go over the objects of all scenes alive, so every scene that
+    stays makes later ones slower, and compiles their kernels again.
+    """
+    with_scene: dict[Any, Any] = {}
 
     def build(spec: SensorSpec, *, pitch: float | None = None, **options: Any) -> Any:
         key = (spec, pitch, tuple(sorted(options.items())))
+        built = without_scene if options.get("integrator", "fast") == "fast" else with_scene
         if key not in built:
             built[key] = make(RayTraced, spec, **options)
         return built[key]

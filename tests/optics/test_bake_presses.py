@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 
 from raytac.optics.camera import Pinhole
-from raytac.optics.taxim.bake.presses import ball_presses, even_sequence, pin_presses, view_half
+from raytac.optics.taxim.bake.presses import ball_presses, even_sequence, pin_presses, punch_presses, view_half
 from raytac.optics.taxim.bake.settings import BakeSettings
 from tests.optics.scenes import grid_of, like_a_mini
 
@@ -33,7 +33,7 @@ def test_golden_ratio_in_one_dimension() -> None:
 
 def test_balls_lie_in_view_and_reach_the_depth_they_say() -> None:
     settings = BakeSettings(images=12, depth=(0.5e-3, 0.9e-3), bare_share=1.0)
-    surfaces = list(ball_presses(SPEC.gelpad, GRID, CAMERA, settings, seed=0))
+    surfaces = list(ball_presses(SPEC.gelpad, GRID, CAMERA, settings, seed=0, bare=True))
     assert len(surfaces) == 12
     half = view_half(CAMERA)
     for surface in surfaces:
@@ -49,6 +49,23 @@ def test_same_seed_same_presses() -> None:
     a, b, c = (list(ball_presses(SPEC.gelpad, GRID, CAMERA, settings, seed)) for seed in (4, 4, 5))
     assert all(np.array_equal(p.height, q.height) for p, q in zip(a, b, strict=True))
     assert not any(np.array_equal(p.height, q.height) for p, q in zip(a, c, strict=True))
+
+
+def test_caps_and_balls_are_the_images_that_were_asked_for() -> None:
+    settings = BakeSettings(images=10, bare_share=0.3)
+    counts = [len(list(ball_presses(SPEC.gelpad, GRID, CAMERA, settings, seed=0, bare=bare))) for bare in (False, True)]
+    assert counts == [7, 3]
+
+
+def test_gel_beside_punches_is_steeper_than_beside_balls() -> None:
+    settings = BakeSettings(images=6, punches=6, bare_share=0.0)
+    balls, pins = (make(SPEC.gelpad, GRID, CAMERA, settings, seed=0) for make in (ball_presses, punch_presses))
+
+    def steepest(surface) -> float:
+        slopes = np.hypot(*np.gradient(surface.indentation[0], *GRID.pitch[::-1]))
+        return slopes[~surface.contact[0]].max()
+
+    assert min(map(steepest, pins)) > max(map(steepest, balls))
 
 
 def test_pins_rise_in_equal_steps() -> None:

@@ -16,7 +16,7 @@ from raytac.physics.soft.pad import SoftPad
 from raytac.physics.soft.reading import SoftReader, UnsolvedContactWarning
 from raytac.physics.soft.scene import SoftScene
 from raytac.physics.soft.settings import Correction
-from raytac.specs import load_sensor
+from raytac.specs import load_sensor, press_of
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from tests.physics.soft_presses import IDENTITY, PITCH, RADIUS, SENSOR, indent, press, soft, uncorrected
 
@@ -42,6 +42,16 @@ def test_the_imprint_is_as_deep_as_commanded(pressed):
     assert surface.indentation.max() == pytest.approx(0.6e-3, rel=0.02)
     deepest = np.unravel_index(surface.indentation[0].argmax(), pad.grid.shape)
     assert abs(pad.grid.x[deepest[1]]) < 0.3e-3 and abs(pad.grid.y[deepest[0]]) < 0.3e-3
+
+
+@pytest.mark.parametrize(("scene", "depth"), [("cone", 0.1e-3), ("cone", 0.2e-3), ("sphere", 0.05e-3)])
+def test_a_shallow_press_of_something_sharp_or_small_touches_at_its_depth(scene, depth):
+    """What the coat's cells cannot follow is pressed in as far as commanded, and is never lifted off the pad."""
+    state = list(uncorrected(press_of(scene, depth=depth)).run())[-1]
+    assert not state.failed[0]
+    assert state.depth[0] == pytest.approx(depth, abs=1.1e-6)
+    rigid = list(RigidPad(SENSOR, press_of(scene, depth=depth), pitch=PITCH).run())[-1]
+    assert 0.3 < state.normal_force[0] / rigid.normal_force[0] < 2.0
 
 
 def test_inside_the_contact_the_coat_is_the_object_and_nowhere_in_it(pressed):

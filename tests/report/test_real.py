@@ -25,8 +25,9 @@ from raytac.gel.surface import GelSurface, make_grid
 from raytac.io.images import read_png, write_png
 from raytac.optics import RayTraced
 from raytac.report.markers import run_calibrate_markers
-from raytac.report.real import RealSettings, real_splits, table_text
+from raytac.report.real import real_splits, table_text
 from raytac.report.real_calibration import run_calibrate_optics
+from raytac.report.real_fits import RealSettings
 from raytac.report.real_imprints import imprint_metrics, imprint_table
 from raytac.report.real_scores import noise_floor, outliers, press_rows, press_scores, summary
 from raytac.sensor import TactileSensor
@@ -286,7 +287,7 @@ def test_outliers_are_named_with_their_reasons() -> None:
     three = Photographs(shots().background, np.zeros((3, 240, 320, 3)), np.full((3, 3), 100.0), np.full(3, 3e-3))
     found = outliers(["a", "b", "c"], np.array([2.0, 2.2, 5.0]), three.circles + moved, three)
     assert list(found) == ["b", "c"]
-    assert found["b"] == "its label is 5.0 px from the fitted circle, more than 4"
+    assert found["b"] == "its circle is 5.0 px from the fitted one, more than 4"
     assert found["c"] == "its error in the contact is more than 2 times the median"
 
 

@@ -100,7 +100,11 @@ def test_height_maps_differ_by_their_heights() -> None:
         ("coin", {"yaw": "left"}, r"yaw = 'left': must be a number in \[-7, 7\] rad"),
         ("coin", {"tilt": 3}, r"tilt = 3: must be a number in \[-1.6, 1.6\] rad"),
         ("coin", {"scale": 0.001}, "scale = 0.001: belongs to a mesh: leave it out with a scene"),
-        ("part.stl", {}, "depth: must be given with a mesh or a height map"),
+        ("coin", {"depth": 0.8}, r"depth = 0.8: must be a number in \(0, 0.05\] m \(0.8e-3 is 0.8 mm"),
+        ("part.stl", {}, "depth, force: one of the two must be given with a mesh or a height map"),
+        ("part.step", {"depth": DEPTH}, r"scene = 'part.step': must be .* a mesh \(.stl, .obj, .ply, .off, .glb\)"),
+        ("heights.npy", {"depth": DEPTH}, r"a height map is pressed in Python: sensor.press\(heights, pitch=..., depth=...\)"),
+        (1e3 * block_map(), {"depth": DEPTH, "pitch": 1e-4}, r"heights = .*: must be in metres, at most 0.1 m"),
         ("part.stl", {"depth": DEPTH, "pitch": 1e-4}, "pitch = 0.0001: belongs to a height map"),
         (block_map(), {"depth": DEPTH}, "pitch: must be given with a height map, in metres"),
         (block_map(), {"depth": DEPTH, "pitch": 1.0}, r"pitch = 1.0: must be a number in \(0, 0.01\] m"),
@@ -136,7 +140,7 @@ def test_what_cannot_be_pressed_gives_the_errors_of_meshes_and_scenes(tmp_path: 
     with pytest.raises(MeshError, match=r"scale is metres per file unit; try 1 for a file in metres"):
         press_of(tmp_path / "metres.stl", depth=DEPTH)
     for depth in (0.0, -1e-3, 1.0, float("nan")):
-        with pytest.raises(SpecError, match="depth_mm"):
+        with pytest.raises(InputError, match=rf"depth = {depth}: must be a number in \(0, 0.05\] m"):
             press_of(part, depth=depth)
     with pytest.raises(SpecError, match=r"depth_mm = 20.0: the press must be less deep than the pad"):
         sensor.press(part, depth=20e-3)
@@ -151,9 +155,13 @@ def test_the_command_takes_a_mesh_and_a_depth_in_millimetres(
     assert main([*command, "--scale", "0.001", "--depth", "0.8", "--out", str(tmp_path / "out")]) == 0
     metrics = read_metrics(tmp_path / "out" / "metrics.json")
     assert metrics["scene"] == "part" and metrics["contact.max_indentation_mm"] == pytest.approx(0.8, rel=0.01)
-    capsys.readouterr()
+    said = capsys.readouterr().err
+    assert f"indentation up to {metrics['contact.max_indentation_mm']:.3f} mm; force on the pad" in said
+    assert f"{metrics['contact.force_z_n']:.2f} N along x, y, z" in said
     assert main([*command, "--out", str(tmp_path / "none")]) == 2
-    assert "depth: must be given with a mesh" in capsys.readouterr().err and not (tmp_path / "none").exists()
+    assert (
+        "depth, force: one of the two must be given with a mesh" in capsys.readouterr().err and not (tmp_path / "none").exists()
+    )
     assert main(["press", "coin", "--scale", "0.1", "--out", str(tmp_path / "none")]) == 2
     assert "scale = 0.1: belongs to a mesh: leave it out with a scene" in capsys.readouterr().err
 

@@ -7,8 +7,9 @@ import re
 from pathlib import Path
 
 import pytest
+import trimesh
 
-from raytac.errors import SpecError
+from raytac.errors import MeshError, SpecError
 from raytac.specs import available, load_sweep
 
 LEAST = 'objects = ["sphere"]\ncount = 3\n'
@@ -19,6 +20,16 @@ def written(folder: Path, text: str) -> Path:
     path = folder / "mine.toml"
     path.write_text(text)
     return path
+
+
+def test_a_mesh_is_an_object_of_a_sweep(tmp_path: Path) -> None:
+    trimesh.creation.box((4.0, 6.0, 3.0)).export(tmp_path / "part.stl")
+    text = 'sensors = ["gelsight_mini"]\nobjects = ["sphere", "part.stl"]\ncount = 3\n' + PRESS
+    _, part = load_sweep(written(tmp_path, text)).objects
+    assert part.name == "part" and part.object.triangles is not None
+    assert math.isclose(float(part.object.triangles.vertices[:, 1].max()), 3e-3)  # millimetres, its middle at the origin
+    with pytest.raises(MeshError, match=r"no_such\.stl.*does not exist"):
+        load_sweep(written(tmp_path, text.replace("part.stl", "no_such.stl")))
 
 
 @pytest.mark.parametrize("name", available("sweep"))

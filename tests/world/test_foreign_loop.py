@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import mujoco
@@ -117,7 +118,10 @@ def test_two_gels_in_one_grasp_each_have_their_own_depth_and_force() -> None:
     for frame in frames.values():
         assert 5e-5 < frame.surface.indentation.max() < 2e-3
     data.qpos[0] = np.nan
-    assert reader.read(data)["left"].failed.all() and np.isnan(reader.read(data)["left"].wrench).all()
+    with pytest.warns(RuntimeWarning, match="environment 0 failed, as frame.failed says: .* beyond the bonded face of a gel"):
+        assert reader.read(data)["left"].failed.all()
+    with warnings.catch_warnings(action="error"):  # once is enough
+        assert np.isnan(reader.read(data)["left"].wrench).all()
 
 
 def test_what_a_foreign_loop_cannot_be_given() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -43,7 +44,8 @@ def quadrature(led: LedSpec, refinement: int = 1) -> EdgePoints:
     return EdgePoints(counts[upright], counts[not upright], upright)
 
 
-def gauss(count: int) -> list[tuple[float, float]]:
+@cache  # a fit asks for the same few rules thousands of times
+def gauss(count: int) -> tuple[tuple[float, float], ...]:
     """Places and weights of the Gauss-Legendre rule of ``count`` points on [0, 1]."""
     places, weights = np.polynomial.legendre.leggauss(count)
-    return [(0.5 + 0.5 * float(x), 0.5 * float(w)) for x, w in zip(places, weights, strict=True)]
+    return tuple((0.5 + 0.5 * float(x), 0.5 * float(w)) for x, w in zip(places, weights, strict=True))

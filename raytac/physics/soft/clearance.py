@@ -27,6 +27,10 @@ class BarrierClearance:
     clearance is the mean of c weighted by pressure, over samples under pressure and where c is no more than barrier and sag explain.
     A larger c is a recess of the object. Facets sag only where the object is convex, that is lower than its own mean over a cell.
 
+    Cells that are wider than the contact, as under a cone's tip, sag by more than the gel would indent. In a press of depth δ the gel
+    itself falls by at most about δ/2 within the contact (a ball's; 0.6 δ a cone's), so the clearance is at most d̂ + δ/2. With o the overlap
+    of object and resting gel, which is δ less the clearance, that is 2 d̂ + o.
+
     The object is shown lower than the solver has it by this clearance, and a press to a depth drives it higher by as much: the coat, not
     the barrier, is at the commanded depth.
 
@@ -37,7 +41,7 @@ class BarrierClearance:
     def __init__(self, surface: CoatSurface, samples: PadGrid, d_hat: float, products: Products) -> None:
         """``samples``: grid at which gaps are taken; ``d_hat``: reach of the barrier [m]."""
         mesh, self._products, device = surface.mesh, products, products.device
-        self._surface, self._device = surface, device
+        self._surface, self._device, self._d_hat = surface, device, d_hat
         self._rows, self._columns = surface.matrices(samples.x, samples.y)
         self._hats = hat_arrays(mesh, samples.x, samples.y, device)
         cell_x, cell_y = (cell_lengths(lines, t) for lines, t in ((mesh.lines_x, samples.x), (mesh.lines_y, samples.y)))
@@ -50,7 +54,7 @@ class BarrierClearance:
         self._mean, self._pressure = (wp.zeros((count, len(mesh.rest)), dtype=wp.float64, device=device) for _ in range(2))
         self._lowest_rows = wp.zeros((count, ny), dtype=wp.float64, device=device)
         self._lowest, self.clearance = (wp.zeros(count, dtype=wp.float64, device=device) for _ in range(2))
-        self._sums = wp.zeros((count, ny), dtype=wp.vec2d, device=device)
+        self._sums = wp.zeros((count, ny), dtype=wp.vec3d, device=device)
         self._unmoved = wp.zeros(count, dtype=wp.float64, device=device)
 
     def measure(self, forces: wp.array, objects: Touched, sound: wp.array) -> None:
@@ -69,7 +73,7 @@ class BarrierClearance:
         self._launch(kernels.mean_over_cells, forces.shape, [self._hats, columns, under, self._lowest, self._mean])
         fields = [self._pressure, self._mean, self._lowest, self._rest, self._reach, self._rise.numbers, under, self._sums]
         self._launch(kernels.gaps_in_rows, self._sums.shape, [self._hats, columns, *fields])
-        self._launch(kernels.mean_gaps, len(self.clearance), [self._sums, self.clearance])
+        self._launch(kernels.mean_gaps, len(self.clearance), [self._sums, wp.float64(self._d_hat), self.clearance])
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, device=self._device)

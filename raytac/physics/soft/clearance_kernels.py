@@ -122,14 +122,18 @@ def gaps_in_rows(
     rest: wp.array2d(dtype=wp.float64), reach: wp.array2d(dtype=wp.float64), rise: wp.array3d(dtype=wp.float32),
     under: wp.array3d(dtype=wp.float64),
     # outputs
-    sums: wp.array2d(dtype=wp.vec2d),
+    sums: wp.array2d(dtype=wp.vec3d),
 ):  # fmt: skip
-    """Sums of pressure × gap and pressure over a row's nodes that touch, by (environment, row)."""
+    """Sums of pressure × gap and pressure over a row's nodes that touch, and greatest overlap.
+
+    By (environment, row); the overlap is of object and resting coat [m].
+    """
     env, row = wp.tid()
-    total, weight = wp.float64(0.0), wp.float64(0.0)
+    total, weight, overlap = wp.float64(0.0), wp.float64(0.0), -infinity()
     highest = lowest[env] + _CUT
     for i in range(under.shape[2]):
         z = under[env, row, i]
+        overlap = wp.max(overlap, rest[row, i] - z)
         p = between_vertices(hats, columns, pressure, env, row, i)
         if wp.isfinite(z) and p > _0:
             gap = z - (rest[row, i] + wp.float64(rise[env, row, i]))
@@ -137,14 +141,15 @@ def gaps_in_rows(
             if gap < reach[row, i] + _SAG * bulge:
                 total += p * gap
                 weight += p
-    sums[env, row] = wp.vec2d(total, weight)
+    sums[env, row] = wp.vec3d(total, weight, overlap)
 
 
 @wp.kernel
-def mean_gaps(sums: wp.array2d(dtype=wp.vec2d), clearance: wp.array(dtype=wp.float64)):
-    """Mean gap [m] of each environment, NaN without pressure."""
+def mean_gaps(sums: wp.array2d(dtype=wp.vec3d), d_hat: wp.float64, clearance: wp.array(dtype=wp.float64)):
+    """Mean gap [m] of each environment, at most 2 d̂ + overlap; NaN without pressure."""
     env = wp.tid()
-    total = wp.vec2d()
+    gap, pressure, overlap = wp.float64(0.0), wp.float64(0.0), -infinity()
     for row in range(sums.shape[1]):
-        total += sums[env, row]
-    clearance[env] = wp.where(total[1] > _0, total[0] / total[1], _NAN)
+        one = sums[env, row]
+        gap, pressure, overlap = gap + one[0], pressure + one[1], wp.max(overlap, one[2])
+    clearance[env] = wp.where(pressure > _0, wp.min(gap / pressure, wp.float64(2.0) * d_hat + overlap), _NAN)

@@ -29,7 +29,7 @@ class PressController:
         self._is_free = scene.object.dynamics == "affine"
         self._weight = max((stage.force or 0.0 for stage in scene.trajectory), default=0.0)
         self.bar = Progress(desc="press", show=False)
-        """Counts the solver's steps."""
+        """Count the solver's steps."""
         self._clear()
 
     def reset(self) -> None:
@@ -100,10 +100,11 @@ class PressController:
         margin = np.where(exact, np.clip(travel, 0.0, self._d_hat), 0.0)
         self._move(depth - margin, self._shear, self._twist)
         if exact.any():
-            self._clearance = self._clearance + self._clearance_error()
+            before = self._clearance
+            self._clearance = before + np.nan_to_num(self._clearance_error())
             self._depth = depth
             self._step()
-            self._settle_depth()
+            self._settle_depth(np.minimum(before, self._clearance))
 
     def _move(
         self, depth: np.ndarray, shear: np.ndarray, twist: np.ndarray, stretch: float = 1.0, *, follow: bool = False
@@ -127,7 +128,7 @@ class PressController:
                 self._load()
                 start = depth = self._depth
             elif follow and step < steps:
-                self._clearance = self._clearance + np.clip(self._clearance_error(), -limits.step, limits.step)
+                self._clearance = self._clearance + np.clip(np.nan_to_num(self._clearance_error()), -limits.step, limits.step)
 
     def _step(self) -> None:
         self._solver.fail(self.failed)
@@ -148,17 +149,34 @@ class PressController:
         self.failed |= ~self._solver.converged
 
     def _clearance_error(self) -> np.ndarray:
-        """Measured less applied clearance [m], (B,); 0 out of contact or at a prescribed force."""
+        """Measured less applied clearance [m], (B,); NaN out of contact, 0 at a prescribed force."""
         clearance = self._reader.clearance(self._solver.coat_state(self.poses()))
-        return np.where(np.isfinite(clearance) & ~self.failed & ~np.isfinite(self._force), clearance - self._clearance, 0.0)
+        return np.where(self.failed | np.isfinite(self._force), 0.0, clearance - self._clearance)
 
-    def _settle_depth(self) -> None:
-        """Correct the clearance until the coat, not the barrier, is at the depth."""
-        for _ in range(self._control.refinements):
+    def _settle_depth(self, touching: np.ndarray | None = None) -> None:
+        """Search the clearance at which the coat, not the barrier, is at the depth.
+
+        ``touching``: a clearance (B,) at which the object is known to touch, so that one at which it does not is too large; without it,
+        an object out of contact stays there. Between a clearance that is too small and one that is too large it goes by the secant.
+        """
+        low, high = np.full(self.num_envs, np.nan) if touching is None else touching, np.full(self.num_envs, np.nan)
+        low_error, high_error = np.full(self.num_envs, np.nan), np.full(self.num_envs, np.nan)
+        for _ in range(self._control.depth_steps):
             error = self._clearance_error()
-            if np.abs(error).max() < self._control.depth_tolerance:
+            lost = np.isnan(error) & np.isfinite(low)
+            error = np.nan_to_num(error)
+            solved = (np.abs(error) < self._control.depth_tolerance) & ~lost
+            if solved.all():
                 return
-            self._clearance = self._clearance + np.clip(error, -self._limits.step, self._limits.step)
+            is_high = lost | (error < 0.0)
+            low, low_error = (np.where(is_high, old, new) for old, new in ((low, self._clearance), (low_error, error)))
+            high = np.where(is_high, self._clearance, high)
+            high_error = np.where(is_high, np.where(lost, np.nan, error), high_error)
+            share = np.clip(low_error / np.where(solved, 1.0, low_error - high_error), 0.1, 0.9)
+            between = low + np.where(np.isfinite(share), share, 0.5) * (high - low)
+            beyond = self._clearance + np.clip(error, -self._limits.step, self._limits.step)
+            chosen = np.where(np.isfinite(between), between, beyond)
+            self._clearance = np.where(solved, self._clearance, chosen)
             self._step()
 
     def _release(self, depth: np.ndarray, fraction: float) -> None:

@@ -151,12 +151,14 @@ class PressControl(_Settings):
     """
     depth_tolerance: float = 1e-6
     """A depth is reached within this [m]."""
+    depth_steps: int = 12
+    """Most steps of the search for a depth."""
     force_tolerance: float = 5e-4
     """A normal force is reached within this share."""
     force_steps: int = 120
     """Most steps of the search for a force; a free object takes up to four times as many."""
     refinements: int = 4
-    """Most repetitions of a correction: of depth, friction, a step that did not converge."""
+    """Most repetitions of a correction: of friction, a step that did not converge."""
     stiffness_change: float = 0.01
     """Least relative change of force that gives the contact's stiffness; less may be friction."""
     growth: float = 8.0

@@ -21,8 +21,11 @@ class EnvThreads:
     """
 
     def __init__(self, threads: int | None = None) -> None:
-        """``threads``: at most so many, the caller's among them; None is one a core."""
-        self.threads = cpu_cores() if threads is None else threads
+        """``threads``: at most so many, the caller's among them.
+
+        None is one a core, or ``OMP_NUM_THREADS`` if that is fewer: it is 1 in the processes of ``Workers``.
+        """
+        self.threads = _allowed() if threads is None else threads
         self._pool: ThreadPoolExecutor | None = None
         self._process = 0
 
@@ -47,6 +50,12 @@ class EnvThreads:
             wait(others)
         for part in others:
             part.result()
+
+
+def _allowed() -> int:
+    """One thread a core, or as many as ``OMP_NUM_THREADS`` says if that is fewer."""
+    named = os.environ.get("OMP_NUM_THREADS", "")
+    return min(cpu_cores(), int(named)) if named.isdecimal() and int(named) > 0 else cpu_cores()
 
 
 def _loop(work: Callable[[int], object], envs: Sequence[int]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from raytac.io.progress import Progress
 from raytac.optics.taxim.bake.fit import BinFit, BinSums, two_sheets
-from raytac.optics.taxim.bake.presses import ball_presses
+from raytac.optics.taxim.bake.presses import ball_presses, punch_presses
 from raytac.optics.taxim.bake.settings import PLAIN, BakeSettings
 from raytac.optics.taxim.bake.shadow import bake_shadow
 from raytac.optics.taxim.bake.views import Calibration, Views
@@ -96,11 +96,20 @@ def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: in
     pins = settings.pins if sensor.optics.shadows else 0
     images = settings.renders(sensor.optics.shadows)
     with Progress(total=images, desc=f"bake {sensor.name}", unit="image", show=progress) as bar:
-        touched, around = (BinSums(settings.n_bins, camera.resolution) for _ in range(2))
-        for views in at.views(ball_presses(sensor.gelpad, grid, camera, settings, seed)):
-            add_samples(touched, views, at.rest_image, views.contact)
-            add_samples(around, views, at.rest_image, ~views.contact)
-            bar.update(len(views.rgb))
+        touched, around, steep = (BinSums(settings.n_bins, camera.resolution) for _ in range(3))
+        pad = sensor.gelpad, grid, camera, settings, seed
+        for presses, untouched in (
+            (ball_presses(*pad), around),
+            (ball_presses(*pad, bare=True), None),
+            (punch_presses(*pad), steep),
+        ):
+            for views in at.views(presses):
+                if untouched is not steep:
+                    add_samples(touched, views, at.rest_image, views.contact)
+                if untouched is not None:  # a bare cap ends in a crease: the slopes beside it are those of no gel
+                    add_samples(untouched, views, at.rest_image, ~views.contact)
+                bar.update(len(views.rgb))
+        around = around.with_thin_bins_of(steep)
         fit, sheets = two_sheets(touched, around, neighbours=settings.neighbours, ridge=settings.ridge)
         shadow = bake_shadow(at, settings=settings, seed=seed, tick=bar.update) if pins else None
     width, height = camera.resolution

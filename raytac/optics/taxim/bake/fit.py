@@ -69,6 +69,13 @@ class BinSums:
         both._gram, both._moment = self._gram + other._gram, self._moment + other._moment
         return both
 
+    def with_thin_bins_of(self, other: BinSums) -> BinSums:
+        """Sums with the samples of ``other`` where there are too few for a polynomial of degree 2."""
+        thin = (self._gram[:, 5, 5] < _MIN_COUNT[2])[:, None, None]
+        both = BinSums(self.n_bins, self.resolution)
+        both._gram, both._moment = self._gram + thin * other._gram, self._moment + thin * other._moment
+        return both
+
     def solve(self, *, neighbours: float, ridge: float) -> BinFit:
         """The polynomials.
 

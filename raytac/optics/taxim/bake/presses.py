@@ -3,7 +3,7 @@
 A real calibration (Taxim's, some fifty presses of one ball) has steep slopes where the ball is and none elsewhere. Here the balls
 differ in size and depth and follow a sequence that fills the space of place × size × depth evenly, so that every slope and direction
 comes up all over the view. Most press with the gel around them yielding (``raytac.gel.pyramid``), as all presses of the rigid pad do;
-the others are *bare* caps, which reach slopes that the surround would round off.
+the others are *bare* caps, which reach slopes that the surround would round off. Pins give the steep gel that no ball has around it.
 """
 
 from __future__ import annotations
@@ -57,33 +57,52 @@ def pressed(grid: PadGrid, parts: list[Part], surround: ElasticSurround | None) 
     return GelSurface(grid, height, under < grid.rest, np.full((1, 2), np.nan))
 
 
-def ball_presses(gelpad: GelpadSpec, grid: PadGrid, camera: Pinhole, settings: BakeSettings, seed: int) -> Iterator[GelSurface]:
-    """``settings.images`` surfaces of one environment, each with up to ``settings.balls`` balls.
+def ball_presses(
+    gelpad: GelpadSpec, grid: PadGrid, camera: Pinhole, settings: BakeSettings, seed: int, *, bare: bool = False
+) -> Iterator[GelSurface]:
+    """Surfaces of one environment with up to ``settings.balls`` balls each.
 
-    Radii are spread evenly in their logarithm, depths below the resting surface under the ball's centre evenly; a ball is never pressed
-    beyond its equator, and its contact lies wholly in view.
+    ``bare``: those without surround. Both kinds together are ``settings.images``. Radii are spread evenly in their logarithm, depths below the resting surface under the
+    ball's centre evenly; a ball is never pressed beyond its equator, and its contact lies wholly in view.
     """
-    points = even_sequence(5, np.random.default_rng(seed).uniform(size=5))
+    points = even_sequence(4, np.random.default_rng([seed, 3] if bare else seed).uniform(size=4))
+    caps = round(settings.images * settings.bare_share)
+    surround = None if bare else ElasticSurround(grid, thickness=gelpad.thickness)
+    for _ in range(caps if bare else settings.images - caps):
+        yield pressed(grid, _crowd("sphere", points, gelpad, camera, settings), surround)
+
+
+def punch_presses(gelpad: GelpadSpec, grid: PadGrid, camera: Pinhole, settings: BakeSettings, seed: int) -> Iterator[GelSurface]:
+    """``settings.punches`` surfaces with up to ``settings.balls`` flat-ended pins each.
+
+    Of all gel that no object touches, that at a pin is steepest. Places, radii and depths are spread as those of balls.
+    """
+    points = even_sequence(4, np.random.default_rng([seed, 2]).uniform(size=4))
     surround = ElasticSurround(grid, thickness=gelpad.thickness)
-    half = view_half(camera)
-    (small, large), (shallow, deep) = settings.radius, settings.depth_range(gelpad.thickness)
-    for _ in range(settings.images):
-        balls: list[tuple[np.ndarray, float]] = []
-        parts: list[Part] = []
-        bare = 0.0
-        for u in (next(points) for _ in range(_TRIES)):
-            radius = small * (large / small) ** u[2]
-            depth = min(shallow + (deep - shallow) * u[3], radius)
-            reach = np.sqrt(radius**2 - (radius - depth) ** 2)
-            centre = (2 * u[:2] - 1) * np.maximum(half - reach, 0.0)
-            if any(np.hypot(*(centre - other)) < reach + size + _GAP for other, size in balls):
-                continue
-            balls.append((centre, reach))
-            parts.append(_placed("sphere", (radius,), gelpad, centre, depth))
-            bare = u[4]
-            if len(balls) == settings.balls:
-                break
-        yield pressed(grid, parts, None if bare < settings.bare_share else surround)
+    for _ in range(settings.punches):
+        yield pressed(grid, _crowd("cylinder", points, gelpad, camera, settings), surround)
+
+
+def _crowd(kind: str, points: Iterator[np.ndarray], gelpad: GelpadSpec, camera: Pinhole, settings: BakeSettings) -> list[Part]:
+    """Balls or pins of one image, apart from each other."""
+    half, is_ball = view_half(camera), kind == "sphere"
+    small, large = settings.radius if is_ball else settings.pin_radius
+    shallow, deep = settings.depth_range(gelpad.thickness)
+    contacts: list[tuple[np.ndarray, float]] = []
+    parts: list[Part] = []
+    for u in (next(points) for _ in range(_TRIES)):
+        radius = small * (large / small) ** u[2]
+        depth = shallow + (deep - shallow) * u[3]
+        depth = min(depth, radius) if is_ball else depth
+        reach = np.sqrt(radius**2 - (radius - depth) ** 2) if is_ball else radius
+        centre = (2 * u[:2] - 1) * np.maximum(half - reach, 0.0)
+        if any(np.hypot(*(centre - other)) < reach + size + _GAP for other, size in contacts):
+            continue
+        contacts.append((centre, reach))
+        parts.append(_placed(kind, (radius,) if is_ball else (radius, _PIN_HALF_LENGTH), gelpad, centre, depth))
+        if len(parts) == settings.balls:
+            break
+    return parts
 
 
 def _placed(kind: str, size: tuple[float, ...], gelpad: GelpadSpec, centre: np.ndarray, depth: float) -> Part:

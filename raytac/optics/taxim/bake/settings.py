@@ -18,6 +18,8 @@ class BakeSettings:
 
     images: int = 400
     """Images with balls."""
+    punches: int = 100
+    """Images with flat-ended pins, for steep gel that no object touches."""
     balls: int = 4
     """Most balls in one image."""
     radius: tuple[float, float] = (1e-3, 6e-3)
@@ -37,10 +39,10 @@ class BakeSettings:
     pins: int = 96
     """Presses of a pin, and as many of a ball, that shadows are read from; 0 bakes none."""
     pin_radius: tuple[float, float] = (0.4e-3, 2e-3)
-    """Thinnest and thickest pin [m]."""
+    """Thinnest and thickest pin, of punches too [m]."""
 
     def __post_init__(self) -> None:
-        for name, lowest in (("images", 1), ("balls", 1), ("n_bins", 3), ("pins", 0)):
+        for name, lowest in (("images", 1), ("punches", 0), ("balls", 1), ("n_bins", 3), ("pins", 0)):
             check_whole(f"bake.{name}", getattr(self, name), lowest)
         for name in ("radius", "depth", "pin_radius"):
             low, high = check_numbers(f"bake.{name}", getattr(self, name), (2,), finite=True)
@@ -52,11 +54,11 @@ class BakeSettings:
     @classmethod
     def quick(cls) -> BakeSettings:
         """Coarse and in seconds, to see that all works."""
-        return cls(images=40, n_bins=45, pins=12)
+        return cls(images=40, punches=10, n_bins=45, pins=12)
 
     def renders(self, shadows: bool) -> int:
-        """Images that a bake renders: balls, and with ``shadows`` pins and balls for these."""
-        return self.images + 6 * self.pins * shadows
+        """Images that a bake renders: balls, punches, and with ``shadows`` pins and balls for these."""
+        return self.images + self.punches + 6 * self.pins * shadows
 
     def depth_range(self, thickness: float) -> tuple[float, float]:
         """Shallowest and deepest press [m] on a pad of this ``thickness`` [m]."""

@@ -118,7 +118,7 @@ class BarrierClearance:
     def __init__(self, surface: CoatSurface, rest: np.ndarray, x: np.ndarray, y: np.ndarray, d_hat: float) -> None:
         """Sample at ``x`` (Nx,), ``y`` (Ny,) [m], where the coat rests at ``rest`` (Ny, Nx) [m]."""
         self.x, self.y, self.rest = x, y, rest
-        self._surface = surface
+        self._surface, self._d_hat = surface, d_hat
         self._rows, self._columns = (m.astype(np.float32) for m in surface.matrices(x, y))
         mesh = surface.mesh
         self._hat_y, self._hat_x = (
@@ -148,7 +148,8 @@ class BarrierClearance:
         gap = np.where(above, underside, 0.0) - self.heights(self._surface.rise(places, upwards))
         touching = above & (pressure > 0.0) & (gap < self._reach + _SAG * self._bulge(underside, above))
         weight = np.where(touching, pressure, 0.0)
-        return float((weight * gap).sum() / weight.sum()) if weight.sum() > 0.0 else float("nan")
+        most = 2.0 * self._d_hat + (self.rest - underside)[above].max()
+        return min(float((weight * gap).sum() / weight.sum()), float(most)) if weight.sum() > 0.0 else float("nan")
 
     def _bulge(self, underside: np.ndarray, above: np.ndarray) -> np.ndarray:
         """Depth of the object below its own mean over a cell [m], (Ny, Nx), 0 where it lies above."""
