@@ -15,6 +15,8 @@ from ipc.solver.step_state import Decisions, Flags
 
 wp.set_module_options({"enable_backward": False})
 
+ENOUGH = wp.constant(1 << 20)
+"""Renewals within a first solve after which there are no more."""
 BAD = 1e100
 """Sizes of steps above this are not finite numbers."""
 SLOW = wp.constant(wp.float64(0.505))
@@ -98,9 +100,12 @@ def after_lag(tolerance: wp.float64, max_relags: wp.int32, d: Decisions, f: Flag
     d.pending[env] = 0
     if d.active[env] != 0:  # within the first solve, whose end is judged
         d.settled[env] = 0
+        if d.changed[env] <= tolerance:
+            d.renewed[env] = ENOUGH
         return
     f.settled[0] = 1
-    if d.relags[env] >= 0:
+    # Renewed where it was only calm, friction of a light body may be off by more than a share of the sum of all forces says.
+    if d.relags[env] > 0 or (d.relags[env] == 0 and d.renewed[env] == 0):
         if d.changed[env] <= tolerance or (2 * d.relags[env] >= max_relags and d.sum_changed[env] <= tolerance):
             return
     if d.relags[env] >= max_relags:
