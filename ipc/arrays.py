@@ -9,7 +9,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 IntArray, IntArray2d = wp.array(dtype=wp.int32), wp.array2d(dtype=wp.int32)
-FloatArray, FloatArray2d = wp.array(dtype=wp.float64), wp.array2d(dtype=wp.float64)
+FloatArray, FloatArray2d, FloatArray3d = wp.array(dtype=wp.float64), wp.array2d(dtype=wp.float64), wp.array3d(dtype=wp.float64)
 SingleArray2d, SingleArray3d = wp.array2d(dtype=wp.float32), wp.array3d(dtype=wp.float32)
 VecArray, VecArray2d = wp.array(dtype=wp.vec3d), wp.array2d(dtype=wp.vec3d)
 Vec4Array2d = wp.array2d(dtype=wp.vec4d)

@@ -35,7 +35,8 @@ class World:
 
     Args:
         bodies: of unique names.
-        settings: of the time step.
+        settings: of the time step; None is the default ones.
+        num_envs: number of environments B.
         device: ``"cpu"``, ``"cuda"``, ``"cuda:1"`` or ``"auto"`` (CUDA if there is one).
         friction: μ by pair of body names, where it differs from ``settings.friction``.
         ignored: pairs of body names that pass through each other.
@@ -207,9 +208,8 @@ class World:
         """Let a step pass without a solve, in environments where nothing touches a bonded body.
 
         Driven bodies go to their targets. Bonded soft bodies go along, bent by inertia and gravity alone, and bodies that move freely stay
-        where they are. Whether that is so is for the caller to know: only for an environment with a small :meth:`distance_from_rest`, whose
-        driven bodies do not come near others, is it what :meth:`step` would do, to within that distance. Forces stay those of the last
-        step.
+        where they are. That is what :meth:`step` would do, to within :meth:`distance_from_rest`, in an environment whose driven bodies do
+        not come near others; the caller has to know that. Forces stay those of the last step.
 
         Args:
             dt, envs: as of :meth:`step`.
@@ -227,16 +227,17 @@ class World:
         self._expected |= chosen
 
     def _can_rest(self) -> bool:
+        """True if no body has a drive, damping or a grip."""
         return not (self._potential.driven or self._potential.grips or self.layout.node_damping.any())
 
     def _prepare(self, dt: ArrayLike | None, envs: ArrayLike | None) -> NDArray[np.bool_]:
-        """Set the length of a step and its targets; returns the mask (B,) of the environments."""
+        """Set the duration of a step and its targets; returns the mask (B,) of the environments."""
         chosen, pot = env_mask(envs, self.num_envs), self._potential
-        lengths = per_env(self.settings.dt if dt is None else dt, (), "dt", self.num_envs)
-        if not (lengths[chosen] > 0.0).all():
+        durations = per_env(self.settings.dt if dt is None else dt, (), "dt", self.num_envs)
+        if not (durations[chosen] > 0.0).all():
             raise IpcError(f"dt = {dt}: it must be positive")
-        if not np.array_equal(lengths, self._dt):
-            self._dt = np.array(lengths)
+        if not np.array_equal(durations, self._dt):
+            self._dt = np.array(durations)
             pot.dt.assign(self._dt)
         if self._targets_set:
             pot.goal_p.assign(self._goal_p)
@@ -256,7 +257,7 @@ class World:
     def contact_arrays(self) -> ContactArrays:
         """All contact pairs as arrays of the device.
 
-        Ask again after a step, which may make more room.
+        A step may replace them by longer ones: ask again after each.
         """
         return self._arrays.contacts()
 
@@ -276,17 +277,17 @@ class World:
             raise IpcError(f"{name!r} is a half-space and has no vertices")
         if frame not in ("world", "body"):
             raise IpcError(f"frame = {frame!r}: choose 'world' or 'body'")
-        solver = self._potential
+        pot = self._potential
         if isinstance(self.bodies[body], SoftBody):
-            y = host(solver.y)[:, self.layout.node_start[body] : self.layout.node_start[body + 1]].copy()
+            y = host(pot.y)[:, self.layout.node_start[body] : self.layout.node_start[body + 1]].copy()
             if frame == "body" and not self.layout.framed[body]:
                 raise IpcError(f"{name!r} has no bonded vertices and so no frame of its own: choose frame='world'")
             if frame == "body":
                 return y
-            return np.einsum("bij,bnj->bni", host(solver.R)[:, body], y) + host(solver.t)[:, body, None]
+            return np.einsum("bij,bnj->bni", host(pot.R)[:, body], y) + host(pot.t)[:, body, None]
         if frame == "body":
             raise IpcError(f"{name!r} is no soft body: frame='body' is for bonded soft bodies")
-        return host(solver.x)[:, self.layout.vert_start[body] : self.layout.vert_start[body + 1]].copy()
+        return host(pot.x)[:, self.layout.vert_start[body] : self.layout.vert_start[body + 1]].copy()
 
     def velocities(self, name: str) -> Floats:
         """World velocities [m/s] of a soft body's vertices or an affine body's corners, (B, n, 3)."""

@@ -1,13 +1,9 @@
-"""Fits of the case's light that tests share: each takes about as long as all the rest of a small image."""
+"""Paths of the fits of the case's light: a fit takes about as long as all the rest of a small image."""
 
 from __future__ import annotations
 
-import functools
 import sys
-from dataclasses import replace
 from typing import Any
-
-from raytac.specs.sensor import SensorSpec
 
 MEASURED = (
     "calibrate/",
@@ -19,34 +15,15 @@ MEASURED = (
 )
 """Folders and files of ``tests`` that measure images: these fit with all paths, the others with ``FEW``."""
 FEW = 1 << 15
+_full: list[int] = []
+"""The library's own number, once it is known."""
 
 
-def share(unseen: SensorSpec, *, few: bool) -> None:
-    """Give ``CaseLight.fit``, once it is imported, a memory of the process: the same geometry, lights and seed, the same object.
-
-    Camera and response, which the case's light does not depend on, are taken from ``unseen`` when sensors are compared. ``few``: fits of
-    the test that begins now take ``FEW`` paths.
-    """
+def limit(*, few: bool) -> None:
+    """Let fits of the test that begins now take ``FEW`` paths, or all, once the renderer is imported."""
     module: Any = sys.modules.get("raytac.optics.trace.interreflection")
     if module is None:
         return
-    light = module.CaseLight
-    if not hasattr(light.fit, "__wrapped__"):
-        light.fit = staticmethod(_remembering(light.fit, unseen))
-    shared: Any = light.fit
-    shared.paths = FEW if few else module.SAMPLES
-
-
-def _remembering(fit: Any, unseen: SensorSpec) -> Any:
-    fits: dict[tuple[Any, ...], Any] = {}
-
-    @functools.wraps(fit)
-    def shared(scene: Any, lamps: Any, groups: list[int], seed: int = 0, samples: int | None = None) -> Any:
-        paths: int = shared.paths if samples is None else samples  # type: ignore[attr-defined]
-        sensor = replace(scene.sensor, name="", camera=unseen.camera, response=unseen.response)
-        key = sensor, scene.grid.rest.tobytes(), tuple(groups), seed, paths, scene.mi.variant()
-        if key not in fits:
-            fits[key] = fit(scene, lamps, groups, seed, paths)
-        return fits[key]
-
-    return shared
+    if not _full:
+        _full.append(module.SAMPLES)
+    module.SAMPLES = FEW if few else _full[0]

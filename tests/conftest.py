@@ -59,7 +59,7 @@ def pytest_collection_finish() -> None:
 def pytest_runtest_setup(item: pytest.Item) -> None:
     one_thread.limit_renderer()
     place = item.path.relative_to(Path(__file__).parent).as_posix()
-    case_lights.share(make_sensor_spec(), few=not place.startswith(case_lights.MEASURED))
+    case_lights.limit(few=not place.startswith(case_lights.MEASURED))
 
 
 def make_sensor_spec() -> SensorSpec:

@@ -74,6 +74,12 @@ def test_links_lead_to_files_and_headings(path: Path) -> None:
     assert broken == []
 
 
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_pages_have_no_marks_of_a_merge(path: Path) -> None:
+    marks = re.findall(r"^(?:<{7}|>{7}) .*$", path.read_text(encoding="utf-8"), flags=re.M)
+    assert not marks, f"{path.relative_to(ROOT)}: {marks}"
+
+
 def test_pages_that_the_code_names_exist() -> None:
     named = {
         (path.relative_to(ROOT).as_posix(), page)

@@ -102,7 +102,7 @@ class Boxes:
 
 @wp.kernel
 def leaves_box(x: VecArray2d, dx: VecArray2d, boxes: Boxes, active: IntArray, stale: IntArray, any_stale: IntArray):
-    """Marks environments in which x or x + dx lies outside its vertex's box."""
+    """Mark environments in which x or x + dx lies outside its vertex's box."""
     env, v = wp.tid()
     if active[env] == 0:
         return
@@ -116,7 +116,7 @@ def leaves_box(x: VecArray2d, dx: VecArray2d, boxes: Boxes, active: IntArray, st
 
 @wp.kernel
 def check_candidates(candidates: Candidates, overflow: IntArray):
-    """Raises the flag if a list did not fit."""
+    """Raise the flag if a list did not fit."""
     env = wp.tid()
     if candidates.pt_count[env] > candidates.pt.shape[1] or candidates.ee_count[env] > candidates.ee.shape[1]:
         overflow[0] = 1
@@ -201,7 +201,7 @@ def add_pair(
     pair: wp.vec3i,
     candidates: Candidates,
 ):
-    """Adds edges (``ee``) or vertex and face if their boxes (``lo``, ``hi``: first's) overlap."""
+    """Add edges (``ee``) or vertex and face if their boxes (``lo``, ``hi``: first's) overlap."""
     lo2, hi2 = prim_box(boxes, surface, env, 2 - wp.int32(ee), pair[1])
     if not overlap(lo, hi, lo2, hi2, surface.d_hat):
         return
@@ -233,7 +233,7 @@ def select_prims(
     list_count: IntArray2d,
     members: IntArray2d,
 ):
-    """Keeps the primitives of each list that reach the box of the body they may touch."""
+    """Keep the primitives of each list that reach the box of the body they may touch."""
     env, i = wp.tid()
     if stale[env] == 0:
         return

@@ -229,7 +229,7 @@ def ccd_pairs(
     # outputs
     alpha: FloatArray,
 ):
-    """Lowers alpha[env] to what the edge-edge (``ee``) or point-triangle pairs allow."""
+    """Lower alpha[env] to what the edge-edge (``ee``) or point-triangle pairs allow."""
     env, i = wp.tid()
     if active[env] == 0 or i >= pairs_of(candidates, ee, env):
         return
@@ -273,7 +273,7 @@ def ccd_plane(
     # outputs
     alpha: FloatArray,
 ):
-    """Lowers alpha[env] to what half-spaces allow, which move from frame 0 to frame 1."""
+    """Lower alpha[env] to what half-spaces allow, which move from frame 0 to frame 1."""
     env, i = wp.tid()
     if active[env] == 0:
         return

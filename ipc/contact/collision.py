@@ -181,6 +181,9 @@ class Collision:
             "row": contacts.mat34d,
             "row_nodes": wp.vec4i,
             "node_row": contacts.mat34d,
+            "row_body": wp.int32,
+            "body_row": contacts.mat34d,
+            "scaled_row": contacts.mat34d,
         }
         self._resize(self.contacts, fields, rows)
         room = pairs if self.friction else 1
@@ -288,7 +291,7 @@ class Collision:
             R, t: rotations and positions of frames (B, frames).
             kappa: stiffness of the barrier (B,).
             friction_eps: ε, the slip at which friction yields [m].
-            last: slip below which rows of friction have the majoriser's curvature [m], (B,).
+            last: slip below which rows of friction have the majoriser's curvature alone [m], (B,).
             active: mask (B,).
             gradient, energy: become the gradient (B, V) [N] and the energy of the barrier (B,) [J].
         """

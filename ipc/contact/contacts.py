@@ -20,7 +20,8 @@ class Contacts:
     """Pairs within d̂ and the rows of their Hessian; a vertex of −1 is unused.
 
     ``concave``: 1 where q qᵀ of a row is subtracted, unless the matrix must be definite.
-    ``node_row``, ``row_nodes``: work space for the same rows over unknowns.
+    The same rows over unknowns (``ipc.solver.linear.turn_row``): ``node_row`` at the nodes ``row_nodes``, −1 for none, and ``body_row`` at
+    the four nodes of an affine body from ``row_body`` on, −1 for none. ``scaled_row``: work space of a preconditioner.
     """
 
     verts: wp.array2d(dtype=wp.vec4i)
@@ -36,6 +37,9 @@ class Contacts:
     concave: IntArray2d
     row_nodes: wp.array2d(dtype=wp.vec4i)
     node_row: wp.array2d(dtype=mat34d)
+    row_body: IntArray2d
+    body_row: wp.array2d(dtype=mat34d)
+    scaled_row: wp.array2d(dtype=mat34d)
 
 
 @wp.func
@@ -88,7 +92,7 @@ def clear(active: IntArray, gradient: VecArray2d, energy: FloatArray, out: Conta
 
 @wp.kernel
 def check_contacts(contacts: Contacts, overflow: IntArray):
-    """Raises the flag if contacts or rows did not fit."""
+    """Raise the flag if contacts or rows did not fit."""
     env = wp.tid()
     if contacts.count[env] > contacts.force.shape[1] or contacts.row_count[env] > contacts.row.shape[1]:
         overflow[0] = 1

@@ -485,24 +485,26 @@ def guard_slips(
     # outputs
     lagged: Lagged,
 ):
-    """Chooses the curvature of the next Newton step for pairs that the step dx from x takes far.
+    """Chooses the next Newton step's curvature for pairs whose slip the step dx from x reverses.
 
-    Beyond ε the law has no curvature along the slip: a pair whose step is longer than its slip may jump to and fro across the law's kink.
-    It has all of the majoriser's curvature in the next step, and less and less in those after, since that converges slowly. Nothing
-    happens while ``halt`` is set, since the step is then repeated.
+    Beyond ε the law has no curvature along the slip, and a pair may jump to and fro across the law's kink. One that would has all of the
+    majoriser's curvature in the next step, and less and less in those after, since that converges slowly; it has none where the step
+    lengthens the slip beyond twice of what it is, as a body does that begins to slide. Nothing happens while ``halt`` is set, since the
+    step is then repeated.
     """
     env, lane = wp.tid()
     if active[env] == 0 or halt[0] != 0:
         return
     for i in range(lane, wp.min(lagged.count[env], lagged.limit.shape[1]), lanes):
         verts, c, n = lagged.verts[env, i], lagged.coef[env, i], lagged.normal[env, i]
-        y = wp.length(lagged.slip[env, i] + sliding(x, start, env, verts, c, n))
-        s = wp.vec3d()
+        u, s = lagged.slip[env, i] + sliding(x, start, env, verts, c, n), wp.vec3d()
         for k in range(4):
             if verts[k] >= 0:
                 s += c[k] * dx[env, verts[k]]
-        if wp.length(s - wp.dot(s, n) * n) > y:
+        if wp.dot(u, u + s) < wp.float64(0.0):
             lagged.guard[env, i] = wp.float64(1.0)
+        elif wp.dot(u, s) > wp.dot(u, u):
+            lagged.guard[env, i] = wp.float64(0.0)
         else:
             lagged.guard[env, i] = GUARD_DECAY * lagged.guard[env, i]
 

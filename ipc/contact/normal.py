@@ -339,7 +339,7 @@ def energy_pairs(
     # outputs
     change: FloatArray,
 ):
-    """Adds the energy change of edge-edge (``ee``) or point-triangle pairs [J]."""
+    """Add the energy change of edge-edge (``ee``) or point-triangle pairs [J]."""
     env, lane = wp.tid()
     if active[env] == 0:
         return
@@ -366,7 +366,7 @@ def energy_plane(
     # outputs
     change: FloatArray,
 ):
-    """Adds the change of the point-plane energy from x0 to x1 [J]."""
+    """Add the change of the point-plane energy from x0 to x1 [J]."""
     env, lane = wp.tid()
     if active[env] == 0:
         return

@@ -42,7 +42,7 @@ def find_drift(x: VecArray2d, dx: VecArray2d, reference: VecArray2d, active: Int
 
 @wp.kernel
 def choose_far(moved: FloatArray, limit: wp.float64, stale: IntArray, active: IntArray, far: IntArray, any_far: IntArray):
-    """Marks environments with new lists, or with a vertex farther away than ``limit`` [m]."""
+    """Mark environments with new lists, or with a vertex farther away than ``limit`` [m]."""
     env = wp.tid()
     far[env] = 0
     if active[env] != 0 and (stale[env] != 0 or not (moved[env] <= limit)):

@@ -93,7 +93,7 @@ def is_affine(system: SystemView, v: wp.int32) -> wp.bool:
 
 @wp.func
 def soft_share(system: SystemView, verts: wp.vec4i, row: mat34d) -> wp.float64:
-    """Σ ‖s_i‖ of a row that couples soft nodes with an affine body, else 0."""
+    """Σ ‖s_i‖ of a row that couples soft nodes with an affine body; 0 of other rows."""
     total = wp.float64(0.0)
     mixed = wp.int32(0)
     for k in range(4):
@@ -123,7 +123,7 @@ def affine_part(system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32,
 
 @wp.func
 def affine_first(system: SystemView, verts: wp.vec4i, after: wp.int32) -> wp.int32:
-    """The first node of an affine body of the row that is not ``after``, or −1."""
+    """First node of an affine body of the row, of another one than ``after`` begins; or −1."""
     for k in range(4):
         if is_affine(system, verts[k]):
             first = system.verts.nodes[verts[k], 0]
@@ -134,7 +134,7 @@ def affine_first(system: SystemView, verts: wp.vec4i, after: wp.int32) -> wp.int
 
 @wp.kernel
 def clear_elimination(e: Elimination, system: SystemView, active: IntArray):
-    """No couplings; S begins as the affine bodies' own blocks."""
+    """Clear the couplings; S begins as the affine bodies' own blocks."""
     env, a, s = wp.tid()
     if active[env] == 0:
         return
@@ -156,7 +156,7 @@ def clear_elimination(e: Elimination, system: SystemView, active: IntArray):
 
 @wp.kernel
 def couple_rows(e: Elimination, system: SystemView, contacts: Contacts, active: IntArray, lanes: wp.int32):
-    """Adds the rows' shares of A and C."""
+    """Add the rows' shares of A and C."""
     env, lane = wp.tid()
     if active[env] == 0:
         return
@@ -219,6 +219,7 @@ def positive_inverse(A: wp.mat33d) -> wp.mat33d:
 
 @wp.func
 def is_zero(A: wp.mat33d) -> wp.bool:
+    """True if all entries are 0."""
     return wp.ddot(A, A) == wp.float64(0.0)
 
 
@@ -311,6 +312,7 @@ def finish_elimination(
 
 @wp.kernel
 def eliminate(e: Elimination, inverse: MatArray2d, r: VecArray2d, running: IntArray, threads: wp.int32, z: VecArray2d):
+    """z = M⁻¹ r of the running environments, where z holds D⁻¹ r."""
     env, lane = wp.tid()
     if running[env] != 0:
         finish_elimination(e, inverse, env, lane, threads, r, z)
@@ -320,7 +322,10 @@ class AffineElimination:
     """The affine bodies of a world in the preconditioner of :mod:`ipc.solver.block_jacobi`.
 
     Args:
+        layout: bodies of the world.
+        batch: number of environments B.
         lanes: threads that share the contact rows of an environment.
+        device: that holds S and C.
     """
 
     def __init__(self, layout: Layout, batch: int, lanes: int, device: wp.Device) -> None:

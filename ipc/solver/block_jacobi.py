@@ -31,7 +31,7 @@ def diagonal_blocks(system: SystemView, active: IntArray, out: MatArray2d):
 
 @wp.kernel
 def diagonal_rows(system: SystemView, contacts: Contacts, spread: wp.bool, active: IntArray, lanes: wp.int32, out: MatArray2d):
-    """Adds the diagonal blocks of Σ q qᵀ.
+    """Add the diagonal blocks of Σ q qᵀ.
 
     With ``spread`` they are s sᵀ/β in rows that couple soft nodes with an affine body.
     """
@@ -61,7 +61,7 @@ def diagonal_rows(system: SystemView, contacts: Contacts, spread: wp.bool, activ
 
 @wp.kernel
 def invert_blocks(free: IntArray, active: IntArray, blocks: MatArray2d):
-    """Inverts in place; one that is not positive becomes the inverse of its mean diagonal."""
+    """Invert in place; a block that is not positive becomes the inverse of its mean diagonal."""
     env, i = wp.tid()
     if active[env] == 0:
         return
@@ -73,6 +73,7 @@ def invert_blocks(free: IntArray, active: IntArray, blocks: MatArray2d):
 
 @wp.kernel
 def apply_blocks(inverse: MatArray2d, r: VecArray2d, running: IntArray, z: VecArray2d):
+    """z = D⁻¹ r."""
     env, i = wp.tid()
     if running[env] != 0:
         z[env, i] = inverse[env, i] * r[env, i]
@@ -81,17 +82,21 @@ def apply_blocks(inverse: MatArray2d, r: VecArray2d, running: IntArray, z: VecAr
 class BlockJacobi:
     """Inverses of the 3×3 diagonal blocks with contact rows, and affine bodies eliminated.
 
+    Where the elimination would take too much memory, the nodes of affine bodies have 3×3 blocks too.
+
     Args:
+        layout: bodies of the world.
+        batch: number of environments B.
         lanes: threads that share the contact rows of an environment.
-        eliminate: False: 3×3 blocks for the nodes of affine bodies too.
+        device: that holds the inverses.
     """
 
     on_host = False
 
-    def __init__(self, layout: Layout, batch: int, lanes: int, device: wp.Device, eliminate: bool = True) -> None:
+    def __init__(self, layout: Layout, batch: int, lanes: int, device: wp.Device) -> None:
         self.lanes = lanes
         self.inverse = wp.zeros((batch, len(layout.node_rest)), dtype=wp.mat33d, device=device)
-        self.affine = AffineElimination(layout, batch, lanes, device) if eliminate and fits(layout, batch) else None
+        self.affine = AffineElimination(layout, batch, lanes, device) if fits(layout, batch) else None
         self.elimination = self.affine.view if self.affine else Elimination()
         """Arrays for :mod:`ipc.solver.pcg_block`, empty where nothing is eliminated."""
 

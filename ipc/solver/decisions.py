@@ -18,15 +18,12 @@ wp.set_module_options({"enable_backward": False})
 BAD = 1e100
 """Sizes of steps above this are not finite numbers."""
 SLOW = wp.constant(wp.float64(0.505))
-"""Share of the last change of friction above which friction is averaged.
-
-Half of it, and some rounding.
-"""
+"""Share of the last change of friction above which friction is averaged: half, and rounding."""
 
 
 @wp.kernel
 def start_step(friction: wp.int32, d: Decisions, f: Flags):
-    """Resets everything for a step; ``alive`` and ``progress`` are set."""
+    """Reset everything for a step, for which ``alive`` and ``progress`` are set already."""
     env = wp.tid()
     zero = wp.float64(0.0)
     alive = d.alive[env]
@@ -58,7 +55,7 @@ def start_step(friction: wp.int32, d: Decisions, f: Flags):
 
 @wp.kernel
 def set_flags(d: Decisions, f: Flags):
-    """Says whether anything remains to be done; flags were cleared."""
+    """Say whether anything remains to be done; flags were cleared."""
     env = wp.tid()
     if f.halt[0] == 0:
         if d.active[env] != 0 or d.pending[env] != 0:
@@ -69,25 +66,27 @@ def set_flags(d: Decisions, f: Flags):
 
 @wp.kernel
 def set_done(f: Flags):
-    """done = 1 unless halted."""
+    """Set ``done`` unless halted."""
     f.done[0] = 1 - f.halt[0]
 
 
 @wp.kernel
 def choose_lagging(d: Decisions, f: Flags):
+    """Lag the friction of environments in which that is pending."""
     env = wp.tid()
     d.lagging[env] = d.pending[env] * (1 - f.halt[0])
 
 
 @wp.kernel
 def after_lag(tolerance: wp.float64, max_relags: wp.int32, d: Decisions, f: Flags):
-    """Minimises (again) where friction is new or changed by more than the tolerance.
+    """Minimise (again) where friction is new or changed by more than the tolerance.
 
-    From half of all renewals on only the sum of the limits has to settle: how a light contact divides it among vertices may lie within
-    what Newton's tolerance leaves open.
+    From half of all renewals on only the sum of the limits has to settle: Newton's tolerance may leave open how a light contact divides it
+    among vertices.
 
-    Where the change is not half the one before, the next forces are the mean of the new and the last: normal forces that friction has
-    changed, and friction that they bound, would else chase each other. A mean alone halves a change; that is no reason for another.
+    Where the change is more than half of the last one, the next forces are the mean of the new and the old ones. Otherwise normal forces
+    that friction has changed, and friction that they bound, would chase each other. A mean alone halves a change; that is no reason for
+    another mean.
 
     An environment that ends here keeps the friction that Newton's method balanced: its forces are those that moved it.
     """
@@ -125,7 +124,7 @@ def after_lag(tolerance: wp.float64, max_relags: wp.int32, d: Decisions, f: Flag
 
 @wp.kernel
 def choose_advancing(d: Decisions, f: Flags):
-    """Advances frames that have not arrived, but for poor ones until the unknowns rest."""
+    """Advance frames that have not arrived; poor ones wait until the unknowns rest."""
     env = wp.tid()
     d.pcg_iterations[env] = 0
     go = 0
@@ -141,7 +140,7 @@ def choose_advancing(d: Decisions, f: Flags):
 
 @wp.kernel
 def after_solve(iterations: IntArray, negative: IntArray, mask: IntArray, d: Decisions, f: Flags):
-    """Counts iterations and asks for a definite matrix after negative curvature."""
+    """Count iterations and ask for a definite matrix after negative curvature."""
     env = wp.tid()
     again = 0
     if mask[env] != 0 and f.halt[0] == 0:
@@ -156,7 +155,7 @@ def after_solve(iterations: IntArray, negative: IntArray, mask: IntArray, d: Dec
 
 @wp.kernel
 def choose_tightening(tolerance: wp.float64, dt: FloatArray, d: Decisions, f: Flags):
-    """Solves on where a loosely solved step is so small that it may be the last."""
+    """Solve on where a loosely solved step is so small that it may be the last."""
     env = wp.tid()
     go = 0
     if d.active[env] != 0 and d.advancing[env] == 0 and f.halt[0] == 0:
@@ -168,7 +167,7 @@ def choose_tightening(tolerance: wp.float64, dt: FloatArray, d: Decisions, f: Fl
 
 @wp.kernel
 def judge_direction(dt: FloatArray, d: Decisions, f: Flags):
-    """Drops environments that are not finite; others advance frames or take a plain step."""
+    """Drop environments that are not finite; others advance frames or take a plain step."""
     env = wp.tid()
     d.plain[env] = 0
     if f.halt[0] != 0:
@@ -189,6 +188,7 @@ def judge_direction(dt: FloatArray, d: Decisions, f: Flags):
 
 @wp.kernel
 def start_advance(d: Decisions, f: Flags):
+    """Begin with the whole of what remains of the frames' motion."""
     env = wp.tid()
     d.shorten[env] = d.advancing[env]
     d.attempts[env] = 0
@@ -199,7 +199,7 @@ def start_advance(d: Decisions, f: Flags):
 
 @wp.kernel
 def try_advance(slack: wp.float64, floor: wp.float64, d: Decisions, f: Flags):
-    """Sets the end of an advance of the present length, and what must stay of the gaps.
+    """Set the end of an advance of the present length, and what must stay of the gaps.
 
     A shortened motion ends where a gap is about used up. It is checked again, since the path of a turning frame is no straight line, and
     with half the limit, or rounding would refuse what was just allowed.
@@ -221,7 +221,7 @@ def try_advance(slack: wp.float64, floor: wp.float64, d: Decisions, f: Flags):
 
 @wp.kernel
 def judge_advance(most: wp.int32, d: Decisions, f: Flags):
-    """Shortens the advance where a gap would close or an element invert."""
+    """Shorten the advance where a gap would close or an element invert."""
     env = wp.tid()
     if d.shorten[env] == 0:
         return
@@ -247,7 +247,7 @@ def judge_advance(most: wp.int32, d: Decisions, f: Flags):
 
 @wp.kernel
 def conclude_advance(blocked: wp.float64, poor: wp.float64, d: Decisions, f: Flags):
-    """Accepts the advance; frames that hardly move after the unknowns rested are blocked."""
+    """Accept the advance; frames that hardly move after the unknowns rested are blocked."""
     env = wp.tid()
     d.accepted[env] = 0
     if f.halt[0] != 0 or d.advancing[env] == 0:
@@ -267,6 +267,7 @@ def conclude_advance(blocked: wp.float64, poor: wp.float64, d: Decisions, f: Fla
 
 @wp.kernel
 def start_limit(slack: wp.float64, d: Decisions, f: Flags):
+    """Begin with the whole Newton step, of which ``slack`` of every gap must stay."""
     env = wp.tid()
     d.slack[env] = slack
     d.floor[env] = wp.float64(0.0)
@@ -275,7 +276,7 @@ def start_limit(slack: wp.float64, d: Decisions, f: Flags):
 
 @wp.kernel
 def start_search(reach: FloatArray, d: Decisions, f: Flags):
-    """Starts the line search, which allows for rounding of positions by force × size × 1e-15."""
+    """Start the line search, which allows for rounding of positions by force × size × 1e-15."""
     env = wp.tid()
     d.trials[env] = 0
     d.searching[env] = 0
@@ -290,12 +291,13 @@ def start_search(reach: FloatArray, d: Decisions, f: Flags):
 
 @wp.kernel
 def clear_det(d: Decisions, f: Flags):
+    """Forget the determinants of the last trial."""
     d.trial_det[wp.tid()] = wp.float64(wp.inf)
 
 
 @wp.kernel
 def judge_energy(armijo: wp.float64, most: wp.int32, d: Decisions, f: Flags):
-    """Ends the search where the energy fell enough (Armijo), else halves the step."""
+    """End the search where the energy fell enough (Armijo), else halve the step."""
     env = wp.tid()
     if d.searching[env] == 0:
         return
@@ -311,6 +313,7 @@ def judge_energy(armijo: wp.float64, most: wp.int32, d: Decisions, f: Flags):
 
 @wp.kernel
 def end_search(d: Decisions, f: Flags):
+    """Accept the step of environments whose search has ended."""
     env = wp.tid()
     d.accepted[env] = 0
     if d.plain[env] != 0 and f.halt[0] == 0:
@@ -330,7 +333,7 @@ def conclude(
     d: Decisions,
     f: Flags,
 ):
-    """Ends an iteration: environments converge, give up, or have their friction lagged again.
+    """End an iteration: environments converge, give up, or have their friction lagged again.
 
     Friction is renewed within a step's first solve after each of its first ``renewals`` Newton iterations, and ``calm_renewals`` times
     after one of at most ``calm`` [m] with all frames in place.
@@ -380,7 +383,7 @@ def conclude(
 
 @wp.kernel
 def choose_good(d: Decisions, f: Flags):
-    """Returns environments that failed, or must converge and did not, to the start of the step."""
+    """Return environments that failed, or must converge and did not, to the start of the step."""
     env = wp.tid()
     lost = d.failed[env]
     if d.alive[env] != 0 and d.converged[env] == 0 and d.keep[env] == 0:

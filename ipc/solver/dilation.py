@@ -108,7 +108,7 @@ def block_energy_change(
     # outputs
     change: FloatArray2d,
 ):
-    """Adds V_b (λ − λ')/2 (J̄ − a)² at y1, less that at y0 [J].
+    """Add V_b (λ − λ')/2 (J̄ − a)² at y1, less that at y0 [J].
 
     Each block's goes to its first element.
     """

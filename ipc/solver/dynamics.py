@@ -60,7 +60,7 @@ def sum_followers(
 ):
     """Contact gradient of nodes that many vertices follow, three numbers each.
 
-    A block of ``threads`` for each environment and node.
+    A block of ``threads`` adds up that of an environment and a node.
     """
     env, k, lane = wp.tid()
     g = wp.vec3d()
@@ -92,11 +92,11 @@ def node_gradient(
     residual: VecArray2d,
     force_size: FloatArray2d,
 ):
-    """Adds inertia, drag and contact to the elastic gradient.
+    """Add inertia, drag and contact to the elastic gradient.
 
-    The residual is its negative on the unknowns, zero on bonded nodes. ``summed_place`` (N,) is a node's place in ``summed``
-    (:func:`sum_followers`), or −1.
-    ``force_size`` is the sum of the sizes of elastic and contact force [N], which scales the rounding of energies.
+    The residual is the negative gradient on the unknowns, zero on bonded nodes. ``summed_place`` (N,) is a node's place in ``summed``
+    (:func:`sum_followers`), or −1. ``force_size`` is the sum of the sizes of elastic and contact force [N], which scales the rounding of
+    energies.
     """
     env, i = wp.tid()
     if active[env] == 0:
@@ -193,6 +193,7 @@ def aim_bodies(
 
 @wp.kernel
 def clear(active: IntArray, values: FloatArray):
+    """Set the values of the active environments to 0."""
     env = wp.tid()
     if active[env] != 0:
         values[env] = wp.float64(0.0)
@@ -210,7 +211,7 @@ def lengths(p: VecArray2d, residual: VecArray2d, size: FloatArray2d):
 
 @wp.kernel
 def restart(right_side: VecArray2d, again: IntArray, residual: VecArray2d, p: VecArray2d):
-    """Restores the right-hand side and clears the solution."""
+    """Restore the right-hand side and clear the solution."""
     env, i = wp.tid()
     if again[env] != 0:
         residual[env, i] = right_side[env, i]

@@ -130,21 +130,6 @@ def row_column(row: mat34d, k: wp.int32) -> wp.vec3d:
 
 
 @wp.func
-def row_motion(system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, p: VecArray2d) -> wp.float64:
-    """q·p with node motions p in their bodies' frames."""
-    s = wp.float64(0.0)
-    for k in range(4):
-        v = verts[k]
-        if v >= 0:
-            if system.verts.count[v] > 0:
-                local = wp.vec3d()
-                for m in range(system.verts.count[v]):
-                    local += system.verts.weight[v, m] * p[env, system.verts.nodes[v, m]]
-                s += wp.dot(row_column(row, k), system.R[env, system.verts.body[v]] * local)
-    return s
-
-
-@wp.func
 def spread_row(system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, s: wp.float64, out: VecArray2d):
     """out += s q on the unknowns."""
     for k in range(4):
@@ -156,6 +141,53 @@ def spread_row(system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, 
                     node = system.verts.nodes[v, m]
                     if system.free[node] != 0:
                         wp.atomic_add(out, env, node, system.verts.weight[v, m] * q)
+
+
+@wp.func
+def turn_row(system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32):
+    """Write row r over the unknowns, in bodies' frames.
+
+    A vertex follows one node, or the four of an affine body. The second affine body of a row is among its nodes, which are free then.
+    """
+    verts, row = contacts.row_verts[env, r], contacts.row[env, r]
+    nodes, turned = wp.vec4i(-1, -1, -1, -1), mat34d()
+    body, g = wp.int32(-1), mat34d()
+    for k in range(4):
+        v = verts[k]
+        if v >= 0:
+            if system.verts.count[v] > 0:
+                q = wp.transpose(system.R[env, system.verts.body[v]]) * row_column(row, k)
+                node = system.verts.nodes[v, 0] + 0
+                if system.verts.count[v] == 1:
+                    if system.free[node] != 0:
+                        nodes[k] = node
+                        w = system.verts.weight[v, 0] + wp.float64(0.0)
+                        for i in range(3):
+                            turned[i, k] = w * q[i]
+                else:
+                    if body < 0:
+                        body = node
+                    for m in range(4):
+                        w = system.verts.weight[v, m] + wp.float64(0.0)
+                        if node == body:
+                            for i in range(3):
+                                g[i, m] = g[i, m] + w * q[i]
+                        else:
+                            nodes[m] = node + m
+                            for i in range(3):
+                                turned[i, m] = turned[i, m] + w * q[i]
+    contacts.row_nodes[env, r] = nodes
+    contacts.node_row[env, r] = turned
+    contacts.row_body[env, r] = body
+    contacts.body_row[env, r] = g
+
+
+@wp.kernel
+def turn_rows(system: SystemView, contacts: Contacts, active: IntArray, lanes: wp.int32):
+    env, lane = wp.tid()
+    if active[env] != 0:
+        for r in range(lane, rows_of(contacts, env), lanes):
+            turn_row(system, contacts, env, r)
 
 
 @wp.func
@@ -175,58 +207,29 @@ def row_weight(system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int3
 
 
 @wp.func
-def add_row(system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32, p: VecArray2d, out: VecArray2d) -> wp.float64:
-    """out += w q (q·p) of row r, on the unknowns; returns w (q·p)², w being its weight."""
-    verts, row = contacts.row_verts[env, r], contacts.row[env, r]
-    w = row_weight(system, contacts, env, r)
-    s = row_motion(system, verts, row, env, p)
-    spread_row(system, verts, row, env, w * s, out)
-    return w * s * s
-
-
-SPREAD = wp.constant(-2)
-"""First node of a row that :func:`add_row` takes as it is: a vertex follows several nodes."""
-
-
-@wp.func
-def turn_row(system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32):
-    """Turn row r into bodies' frames: ``node_row`` at unknowns ``row_nodes``, −1 for none."""
-    verts, row = contacts.row_verts[env, r], contacts.row[env, r]
-    turned, nodes = mat34d(), wp.vec4i(-1, -1, -1, -1)
-    for k in range(4):
-        v = verts[k]
-        if v >= 0:
-            if system.verts.count[v] > 1:
-                contacts.row_nodes[env, r] = wp.vec4i(SPREAD, -1, -1, -1)
-                return
-            if system.verts.count[v] == 1:
-                node = system.verts.nodes[v, 0]
-                if system.free[node] != 0:
-                    q = system.verts.weight[v, 0] * (wp.transpose(system.R[env, system.verts.body[v]]) * row_column(row, k))
-                    nodes[k] = node
-                    for i in range(3):
-                        turned[i, k] = q[i]
-    contacts.row_nodes[env, r] = nodes
-    contacts.node_row[env, r] = turned
-
-
-@wp.func
-def add_turned_row(
-    system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32, p: VecArray2d, out: VecArray2d
-) -> wp.float64:
-    """The same as :func:`add_row`, with what :func:`turn_row` prepared."""
-    nodes = contacts.row_nodes[env, r]
-    if nodes[0] == SPREAD:
-        return add_row(system, contacts, env, r, p, out)
+def row_motion(row: mat34d, nodes: wp.vec4i, body: wp.int32, g: mat34d, env: wp.int32, p: VecArray2d) -> wp.float64:
+    """q·p of a turned row."""
     s = wp.float64(0.0)
-    row = contacts.node_row[env, r]
     for k in range(4):
         if nodes[k] >= 0:
             s += wp.dot(row_column(row, k), p[env, nodes[k]])
+    if body >= 0:
+        for m in range(4):
+            s += wp.dot(row_column(g, m), p[env, body + m])
+    return s
+
+
+@wp.func
+def add_row(system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32, p: VecArray2d, out: VecArray2d) -> wp.float64:
+    """out += w q (q·p) of the turned row r on the unknowns, with weight w; returns w (q·p)²."""
+    nodes, row = contacts.row_nodes[env, r], contacts.node_row[env, r]
+    body, g = contacts.row_body[env, r] + 0, contacts.body_row[env, r]
+    s = row_motion(row, nodes, body, g, env, p)
     w = row_weight(system, contacts, env, r)
     for k in range(4):
         if nodes[k] >= 0:
             wp.atomic_add(out, env, nodes[k], (w * s) * row_column(row, k))
+    add_motion(env, body, (w * s) * g, out)
     return w * s * s
 
 
@@ -242,37 +245,31 @@ def multiply_rows(
     out: VecArray2d,
     partial: FloatArray2d,
 ):
-    """out += Σ q (q·p), and the shares of Σ (q·p)²; bonded nodes have p = 0 and get nothing.
+    """out += Σ q (q·p) of turned rows, and the shares of Σ (q·p)².
 
-    Threads as in multiply_blocks, of which ``lanes`` in all share the rows of an environment.
+    Threads as in multiply_blocks, of which ``lanes`` in all share the rows of an environment. A thread adds up what its rows give to one
+    affine body.
     """
     env, c, lane = wp.tid()
     total = wp.float64(0.0)
     first = c * threads + lane
     if active[env] != 0 and first < lanes:
-        body, affine = wp.int32(-1), mat34d()
+        last, affine = wp.int32(-1), mat34d()
         for r in range(first, rows_of(contacts, env), lanes):
-            verts, row = contacts.row_verts[env, r], contacts.row[env, r]
-            weight = row_weight(system, contacts, env, r)
-            s = row_motion(system, verts, row, env, p)
-            total += weight * s * s
+            nodes, row = contacts.row_nodes[env, r], contacts.node_row[env, r]
+            body, g = contacts.row_body[env, r] + 0, contacts.body_row[env, r]
+            s = row_motion(row, nodes, body, g, env, p)
+            w = row_weight(system, contacts, env, r)
+            total += w * s * s
             for k in range(4):
-                v = verts[k]
-                if v >= 0:
-                    if system.verts.count[v] > 0:
-                        q = (weight * s) * (wp.transpose(system.R[env, system.verts.body[v]]) * row_column(row, k))
-                        node = system.verts.nodes[v, 0]
-                        if system.verts.count[v] == 1:
-                            if system.free[node] != 0:
-                                wp.atomic_add(out, env, node, system.verts.weight[v, 0] * q)
-                        else:
-                            if node != body:
-                                add_motion(env, body, affine, out)
-                                body, affine = node, mat34d()
-                            for m in range(4):
-                                for i in range(3):
-                                    affine[i, m] = affine[i, m] + system.verts.weight[v, m] * q[i]
-        add_motion(env, body, affine, out)
+                if nodes[k] >= 0:
+                    wp.atomic_add(out, env, nodes[k], (w * s) * row_column(row, k))
+            if body >= 0:
+                if body != last:
+                    add_motion(env, last, affine, out)
+                    last, affine = body, mat34d()
+                affine += (w * s) * g
+        add_motion(env, last, affine, out)
     wp.tile_store(partial[env], wp.tile_sum(wp.tile(total)), offset=c)
 
 

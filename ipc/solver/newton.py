@@ -288,6 +288,7 @@ class Newton:
     def _update_preconditioner(self, mask: wp.array) -> None:
         pot, contacts = self.potential, self.potential.collision.contacts
         with self._stage("preconditioner"):
+            pot.turn_rows(mask)
             self.preconditioner.update(pot.system, contacts, contacts.row.shape[1], mask)
 
     def _iterate_linear(self, mask: wp.array, tolerance: float) -> None:

@@ -16,7 +16,7 @@ from ipc.arrays import FloatArray, FloatArray2d, IntArray, MatArray2d, VecArray2
 from ipc.contact.contacts import Contacts, rows_of
 from ipc.solver.affine_elimination import Elimination, finish_elimination
 from ipc.solver.blocks import block_sum, wait_for_block
-from ipc.solver.linear import SystemView, add_turned_row, block_row, find_volume_motion, turn_row
+from ipc.solver.linear import SystemView, add_row, block_row, find_volume_motion
 
 wp.set_module_options({"enable_backward": False})
 
@@ -86,12 +86,6 @@ def solve_in_one_block(
         s.negative[env] = 0
     if rr0 == wp.float64(0.0):
         return
-    # A thread uses only rows that it has turned itself.
-    i = lane
-    if lane < lanes:
-        while i < rows:
-            turn_row(system, contacts, env, i)
-            i += lanes
     wait_for_block()
     for it in range(max_iterations):
         if volumes > 0:
@@ -113,7 +107,7 @@ def solve_in_one_block(
         i = lane
         if lane < lanes:
             while i < rows:
-                a += add_turned_row(system, contacts, env, i, p, Ap)
+                a += add_row(system, contacts, env, i, p, Ap)
                 i += lanes
         curvature = block_sum(a)
         if not (curvature > wp.float64(0.0)):

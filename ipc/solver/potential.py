@@ -19,7 +19,7 @@ from ipc.contact.collision import Collision
 from ipc.reduce import BLOCK, MAX, MIN, SUM, Reducer
 from ipc.settings import Settings
 from ipc.solver import dilation, dynamics, elasticity, frames
-from ipc.solver.linear import SystemView, find_volume_motions, push_blocks, push_rows, slice_rows
+from ipc.solver.linear import SystemView, find_volume_motions, push_blocks, push_rows, slice_rows, turn_rows
 
 _SLICE = 32
 """Rows of the matrix that lie interleaved on CUDA: as many as threads run in step."""
@@ -31,7 +31,12 @@ class Potential:
     """State and work space of a batch, and the launches that evaluate them.
 
     Args:
-        d_hat: [m].    kappa: [Pa].
+        layout: bodies of the world.
+        settings: of the solver.
+        batch: number of environments B.
+        d_hat: distance below which surfaces repel [m].
+        kappa: stiffness of the barrier [Pa].
+        device: that holds all arrays.
     """
 
     def __init__(self, layout: Layout, settings: Settings, batch: int, d_hat: float, kappa: float, device: wp.Device) -> None:
@@ -207,20 +212,9 @@ class Potential:
 
     def touch(self, active: wp.array) -> None:
         """Contacts, their forces and rows at x."""
-        self.collision.assemble(
-            *(
-                self.x,
-                self.x_start,
-                self.R,
-                self.t,
-                self.kappa,
-                self.friction_eps,
-                self.last,
-                active,
-                self.vert_gradient,
-                self.barrier,
-            )
-        )
+        placed = self.R, self.t
+        outputs = self.vert_gradient, self.barrier
+        self.collision.assemble(self.x, self.x_start, *placed, self.kappa, self.friction_eps, self.last, active, *outputs)
 
     def assemble(self, active: wp.array) -> None:
         """Forces, contacts and energies at y; ``residual`` is −``gradient`` on the unknowns."""
@@ -257,6 +251,11 @@ class Potential:
             inputs, row = [self.elements, self.volumes, self.el_F, active], self.system.volume_row
             self.launch(dilation.dilation_rows, row.shape, inputs, [row])
 
+    def turn_rows(self, active: wp.array) -> None:
+        """Write the contact rows of :meth:`touch` over the unknowns."""
+        lanes = self.collision.lanes
+        self.launch(turn_rows, (self.batch, lanes), [self.system, self.collision.contacts, active, lanes])
+
     def try_step(self, alpha: wp.array) -> None:
         """y1 = y + alpha p and its vertices, in the frames as they are."""
         self.launch(dynamics.advance_nodes, self.y.shape, [self.y, self.p, alpha, self.y1])
@@ -279,9 +278,8 @@ class Potential:
         inputs = [self.y, self.y1, self.local_target, self.local_start, self.masses, self.dt, active]
         self.launch(dynamics.inertia_change, self.y.shape, inputs, [self.node_change])
         self.reduce(self.node_change, active, SUM, change)
-        self.collision.energy_change(
-            *(self.x, self.x1, self.x_start, self.R, self.t, self.kappa, self.friction_eps, active, change)
-        )
+        placed = self.R, self.t
+        self.collision.energy_change(self.x, self.x1, self.x_start, *placed, self.kappa, self.friction_eps, active, change)
 
     def slope(self, active: wp.array, slope: wp.array, noise: wp.array) -> None:
         """``slope`` (B,) ← g·p [J]; ``noise`` (B,) ← Σ ‖force‖ [N], for rounding of energies."""

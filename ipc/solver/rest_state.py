@@ -105,7 +105,7 @@ def carry_nodes(
     v: VecArray2d,
     gradient: VecArray2d,
 ):
-    """Takes bonded bodies along to the goals; others stay and stand still."""
+    """Take bonded bodies along to the goals; others stay and stand still."""
     env, i = wp.tid()
     if mask[env] == 0:
         return

@@ -100,7 +100,8 @@ def read_presses(data: Path | str, *, ball_diameter: float | None = None) -> Rea
     if data.is_dir():
         matching = [name for name in LAYOUTS if (data / name).exists()]
         if not matching:
-            raise InputError("data", value=str(data), rule="must hold one of the files that tell a layout", choices=LAYOUTS)
+            rule = "must hold one of the files that tell a layout; plain photographs are PNGs beside background.png"
+            raise InputError("data", value=str(data), rule=rule, choices=LAYOUTS)
         data, is_plain = data / matching[0], matching[0] == LAYOUTS[-1]
     if data.name.endswith(".npz") or is_plain:
         if ball_diameter is None:

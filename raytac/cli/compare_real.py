@@ -48,7 +48,8 @@ class CompareRealArgs(FitOptions):
 
     def run(self) -> int:
         began = time.perf_counter()
-        from raytac.report.real import RealSettings, check_folds, compare_real
+        from raytac.report.real import check_folds, compare_real
+        from raytac.report.real_fits import RealSettings
 
         quiet_warp()
         sensor, presses, shots = self.read(self.data, self.sensor)

@@ -30,7 +30,7 @@ from raytac.io.options import parse_names, parse_resolution
 from raytac.optics import OPTICS
 from raytac.physics import PHYSICS
 from raytac.report.measure import machine
-from raytac.specs import SweepSpec, load_sweep
+from raytac.specs import SweepSpec, available, load_sweep
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +41,8 @@ class DatasetArgs(SolverOptions):
     runs/dataset. Killed at any time, the same command goes on where it stopped. Needs raytac[dataset], with --engine ray raytac[ray].
     """
 
-    sweep: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SWEEP")] = "demo"
-    """Name of a shipped sweep, or path of a sweep file."""
+    sweep: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="SWEEP")] = None
+    """Name of a shipped sweep, such as demo, or path of a sweep file; --verify needs none."""
     seed: int | None = None  # type: ignore[assignment]
     """Seed of all presses; the sweep's if not given."""
     count: int | None = None
@@ -158,4 +158,6 @@ class DatasetArgs(SolverOptions):
             "resolution": None if self.resolution is None else parse_resolution(self.resolution),
             "outputs": None if self.outputs is None else parse_names(self.outputs, "outputs"),
         }
+        if self.sweep is None:
+            raise InputError("sweep", rule="must be given: a name, or the path of a file", choices=available("sweep"))
         return replace(load_sweep(self.sweep), **{name: value for name, value in asked.items() if value is not None})

@@ -19,7 +19,7 @@ REQUIRED = ("index", "status", "shard", "row", "sensor", "shard_sha256")
 
 
 def check_pyarrow() -> None:
-    """Raises ``BackendError`` where Parquet cannot be written."""
+    """Raise ``BackendError`` where Parquet cannot be written."""
     try:
         import pyarrow  # noqa: F401
     except ImportError as error:

@@ -116,14 +116,14 @@ class DatasetPlan:
 
     def variant(self, shard: int) -> tuple[int, int]:
         """Number of the sensor of a shard, and of its drawn copy: shards take turns."""
-        which = shard % (len(self.sweep.sensors) * self.sweep.variants)
-        return which % len(self.sweep.sensors), which // len(self.sweep.sensors)
+        copy, sensor = divmod(shard % (len(self.sweep.sensors) * self.sweep.variants), len(self.sweep.sensors))
+        return sensor, copy
 
     def sensor(self, shard: int) -> SensorSpec:
         """Sensor of a shard, as drawn."""
-        which, copy = self.variant(shard)
+        sensor, copy = self.variant(shard)
         seed = int(np.random.SeedSequence((self.sweep.seed, 0x5E, copy)).generate_state(1)[0])
-        return randomised_sensor(self.sweep.sensors[which], self.randomization, seed)
+        return randomised_sensor(self.sweep.sensors[sensor], self.randomization, seed)
 
     def presses(self, shard: int) -> Presses:
         """Presses of a shard; press i depends on the sweep's seed, ranges and objects, and on i."""
@@ -137,25 +137,25 @@ class DatasetPlan:
         streams = [np.random.default_rng((self.sweep.seed, int(i))) for i in index]
         u = np.array([stream.random(_DRAWS) for stream in streams]).reshape(len(index), _DRAWS).T
         seed = np.array([stream.integers(2**32) for stream in streams], np.int64)
-        r = self.sweep.ranges
+        ranges = self.sweep.ranges
 
         def between(ends: tuple[float, float], share: np.ndarray) -> np.ndarray:
             return ends[0] + (ends[1] - ends[0]) * share
 
-        length, azimuth = between(r.shear, u[6]), 2.0 * np.pi * u[7]
+        shear, shear_direction = between(ranges.shear, u[6]), 2.0 * np.pi * u[7]
         return Presses(
             index=np.asarray(index, np.int64),
             scene=np.minimum((u[0] * len(self.sweep.objects)).astype(np.int64), len(self.sweep.objects) - 1),
             seed=seed,
-            press_depth=between(r.depth, u[1]),
-            x=between(r.x, u[2]),
-            y=between(r.y, u[3]),
-            yaw=between(r.yaw, u[4]),
-            tilt=between(r.tilt, u[5]),
+            press_depth=between(ranges.depth, u[1]),
+            x=between(ranges.x, u[2]),
+            y=between(ranges.y, u[3]),
+            yaw=between(ranges.yaw, u[4]),
+            tilt=between(ranges.tilt, u[5]),
             tilt_direction=2.0 * np.pi * u[9],
-            shear_x=length * np.cos(azimuth),
-            shear_y=length * np.sin(azimuth),
-            twist=between(r.twist, u[8]),
+            shear_x=shear * np.cos(shear_direction),
+            shear_y=shear * np.sin(shear_direction),
+            twist=between(ranges.twist, u[8]),
         )
 
     def sensor_options(self, num_envs: int) -> dict[str, Any]:
@@ -195,8 +195,8 @@ class DatasetPlan:
     @property
     def frames(self) -> int:
         """Frames of a press: 1, or those of a video."""
-        each = self.sweep.frames_per_stage
-        return 1 if each is None else 1 + each * len(press_stages(self.sweep.ranges))
+        per_stage = self.sweep.frames_per_stage
+        return 1 if per_stage is None else 1 + per_stage * len(press_stages(self.sweep.ranges))
 
     def array_shapes(self, sensor: SensorSpec, kinds: Mapping[str, ArrayKind] | None = None) -> dict[str, tuple[int, ...]]:
         """Shape of every array of one press, by name; with ``shared``, of those once a shard."""
@@ -218,7 +218,10 @@ class DatasetPlan:
         return count * self.press_bytes(sensor) + self._shared_bytes(sensor)
 
     def total_bytes(self, without: Collection[int] = ()) -> int:
-        """Bytes on disk of all shards but those ``without``, in a time that does not grow."""
+        """Bytes on disk of all shards but those ``without``, not compressed.
+
+        The time that it takes does not grow with the number of shards.
+        """
         kinds, last = len(self.sweep.sensors), self.shards - 1
         done = Counter(shard % kinds for shard in without)  # shards take turns over the sensors
         total = 0
@@ -237,13 +240,11 @@ class DatasetPlan:
     def description(self) -> dict[str, Any]:
         """All that the presses depend on but code and device, as plain values without any path."""
         sweep = self.sweep
+        own = {n: v for n, v in vars(sweep).items() if n not in ("sensors", "objects", "source", "ranges", "name")}
+        if sweep.frames_per_stage is None:
+            del own["frames_per_stage"]  # data sets from before there were videos go on
         facts = {
-            **{
-                name: value
-                for name, value in vars(sweep).items()
-                if name not in ("sensors", "objects", "source", "ranges", "name")
-                and (name, value) != ("frames_per_stage", None)  # so older data sets go on
-            },
+            **own,
             "press": {name: list(ends) for name, ends in vars(sweep.ranges).items()},
             "sensors": {s.name: _sensor_digest(s) for s in sweep.sensors},
             "objects": {scene.name: _object_of(scene) for scene in sweep.objects},
@@ -283,6 +284,7 @@ class DatasetPlan:
             MarkerPattern.of(sensor, self.resolution(sensor), shift=shift, turn=turn)
 
     def _error(self, key: str, ends: tuple[float, float], rule: str) -> RaytacError:
+        """Error of a range of the sweep's ``[press]`` table; ``ends`` [m]."""
         return SpecError(rule, file=self.sweep.source, key=f"press.{key}", value=in_mm(ends))
 
 

@@ -368,7 +368,7 @@ def _row(observation: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _infos(having: np.ndarray, values: dict[str, Any]) -> dict[str, Any]:
-    """Entries with the masks of Gymnasium's vectors: ``having`` (B,), the environments that have an entry."""
+    """Entries with the masks of Gymnasium's vectors; ``having`` (B,): environments with one."""
     result: dict[str, Any] = {}
     for name, value in values.items():
         result[name] = _infos(having, value) if isinstance(value, dict) else value

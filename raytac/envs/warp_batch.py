@@ -100,8 +100,15 @@ class WarpBatch:
         """
         length = task.max_episode_steps if max_episode_steps is None else max_episode_steps
         self.task, self.num_envs, self.max_episode_steps = task, num_envs, check_whole("max_episode_steps", length)
-        given = {"physics": checked_physics("rigid"), "scene": scene, "randomization": randomization}
-        sensors = TaskSensors.of(task, tactile, **given, num_envs=num_envs, seed=seed)
+        sensors = TaskSensors.of(
+            task,
+            tactile,
+            physics=checked_physics("rigid"),
+            scene=scene,
+            randomization=randomization,
+            num_envs=num_envs,
+            seed=seed,
+        )
         loaded, frequency = sensors.scene, task.motion.frequency
         self.world = world = WarpWorld(
             loaded, num_envs=num_envs, device=device, frequency=frequency, launches=launches, contacts=contacts, rows=rows
@@ -133,7 +140,7 @@ class WarpBatch:
         steps = torch.zeros(num_envs, dtype=torch.int64, device=self.device)
         now, duration = (self._state["tool"], self._body_now(), steps), self.control_timestep
         self._progress = TaskProgress(task, *now, actions=self.size, duration=duration, errors=self._errors)
-        # What graphs read and write stays where it is.
+        # Arrays that the recorded graphs read and write must stay in one place: they are filled and never replaced.
         self._ended = torch.ones(num_envs, dtype=torch.bool, device=self.device)
         self._tool_target, self._tool_twist = wp.to_torch(world.tool_target), wp.to_torch(world.tool_twist)
         self._tool_target.copy_(self._state["tool"])
@@ -264,7 +271,7 @@ class WarpBatch:
             self._opening.copy_(self._control.gap[:, None])
 
     def _begin(self, mask: torch.Tensor) -> None:
-        """Begin episodes by a mask (B,): whether there are any, the host does not know."""
+        """Begin episodes by a mask (B,) of the device; the host does not know if there are any."""
         self._ended.copy_(mask)
         starts, ended = self._draw(), self._ended
         bodies, pad = starts.bodies, self.task.stands_on
@@ -284,16 +291,18 @@ class WarpBatch:
             self.touch.begin(ended)
 
     def _draw(self) -> Starts:
+        """Starts of all environments."""
         u = torch.rand(self.num_envs, self.task.draws, generator=self._generator, dtype=torch.float64, device=self.device)
         return self.task.starts(u, self.start_tool, self.start_body)
 
     def _draw_variation(self) -> Variation:
+        """Differences of all environments from the scene."""
         shape = self.num_envs, self._ranges.count
         u = torch.rand(shape, generator=self._generator, dtype=torch.float64, device=self.device)
         return self._ranges.of(2.0 * u - 1.0)
 
     def _vary(self, drawn: Variation) -> None:
-        """Write what was drawn to where the graph reads it."""
+        """Write the drawn variation into the arrays that the graph reads."""
         for (kind, name), column in self._varied.items():
             column.copy_(getattr(drawn, kind)[name])
 
@@ -327,7 +336,7 @@ class WarpBatch:
             self.touch.launch()
 
     def _captured(self, launch: Callable[[], None]) -> Callable[[], None]:
-        """Kernels as one graph on CUDA, which runs in PyTorch's stream; it runs once before."""
+        """Record kernels as one graph on CUDA, after they ran once; it runs in PyTorch's stream."""
         graph = self.world.engine.capture(launch)
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)

@@ -35,7 +35,7 @@ class Matrices:
 
 
 class Products:
-    """Makes matrices for one device and multiplies them; one may be common to all."""
+    """Matrices of one device and their products; one may be common to all."""
 
     def __init__(self, num_envs: int, device: Any) -> None:
         start_warp()
@@ -43,7 +43,7 @@ class Products:
         self.lanes = kernels.CPU_LANES if self.device.is_cpu else kernels.CUDA_LANES
         self._spans: dict[int, wp.array] = {}
         self.all = wp.full(num_envs, value=1, dtype=wp.int32, device=self.device)
-        """Marks every environment as active."""
+        """Mark every environment as active."""
 
     def zeros(self, rows: int, columns: int, num_envs: int | None = None) -> Matrices:
         """Matrices of zeros."""

@@ -16,6 +16,8 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.warp_runtime import HostArrays, Recorded, start_warp
 
 CONTACT_RULES = ("unilateral", "threshold")
+_UNILATERAL = -1.0
+"""In place of a threshold's share, for the kernels."""
 _FINEST = 0.2
 """Share of the pitch below which Gaussians are skipped: the grid cannot resolve them."""
 _ROUNDING = 1e-5
@@ -25,15 +27,9 @@ _FACE = 1e-8
 _REACH = 5.3
 """Standard deviations at which a Gaussian is 10⁻⁶ of its peak."""
 _CPU_LANES, _CUDA_LANES = 16, 4
-"""Nodes in a packet.
-
-It is a vector register of a processor, or what a thread of CUDA reads at once.
-"""
+"""Nodes in a packet: a processor's vector register, or what a CUDA thread reads at once."""
 _STACK = 1 << 17
-"""Nodes of all environments that a CPU processes at once.
-
-So they stay in a core's cache.
-"""
+"""Nodes of all environments that a CPU processes at once: they stay in a core's cache."""
 
 
 class ElasticSurround:
@@ -96,7 +92,7 @@ class ElasticSurround:
         start_warp()
         self.grid, self.device = grid, wp.get_device(device)
         self._lanes = _CPU_LANES if self.device.is_cpu else _CUDA_LANES
-        self._scale = contact_scale if contact_rule == "threshold" else -1.0
+        self._scale = contact_scale if contact_rule == "threshold" else _UNILATERAL
         self._lowest, self._shallow = float(-thickness - _FACE), float(thickness + grid.rest.min())
         finest = _FINEST * min(grid.pitch)
         if steps is None and contact_rule == "threshold":
@@ -112,6 +108,7 @@ class ElasticSurround:
         self._allocate(num_envs)
 
     def _allocate(self, num_envs: int) -> None:
+        """Make the arrays, rows of which are whole packets."""
         (ny, nx), lanes = self.grid.shape, self._lanes
         count, (packet, mask) = -(-nx // lanes), kernels.packet_types(lanes)
         lines = kernels.ROWS * -(-ny // kernels.ROWS)
@@ -147,12 +144,12 @@ class ElasticSurround:
         )
         return GelSurface(self.grid, height, contact, centre, pad_from_object)
 
-    def _surface(self, under: np.ndarray) -> tuple[np.ndarray, ...]:
+    def _surface(self, object_height: np.ndarray) -> tuple[np.ndarray, ...]:
         """Height, contact and its centre of at most ``num_envs`` environments."""
         inputs, launch = self._host
-        (overlap, window, deepest), count = inputs.values, len(under)
+        (overlap, window, deepest), count = inputs.values, len(object_height)
         u = overlap[:count]
-        np.subtract(self.grid.rest, under, out=u, casting="same_kind")
+        np.subtract(self.grid.rest, object_height, out=u, casting="same_kind")
         deepest[:count] = u.max(axis=(1, 2))
         failed = np.isnan(deepest[:count])
         np.maximum(u, np.float32(0.0), out=u)
@@ -188,36 +185,38 @@ class ElasticSurround:
         Nothing waits for the device.
         """
         ny = self.grid.shape[0]
+        is_unilateral = self._scale == _UNILATERAL
         for first in self._firsts:
             envs = min(len(self._field), len(self.lost) - first)
-            lines, overlap, before = (envs, ny), (self._overlaps, self.deepest, self._scale), np.zeros(2, int)
-            for k, blur in enumerate(self._pyramid):
-                before = self._smooth(first, envs, before, blur, k, imposes=self._scale < 0.0)
-                if self._scale >= 0.0:
+            lines, overlap, reach = (envs, ny), (self._overlaps, self.deepest, self._scale), np.zeros(2, int)
+            for k, gaussian in enumerate(self._pyramid):
+                reach = self._smooth(first, envs, reach, gaussian, k, imposes=is_unilateral)
+                if not is_unilateral:
                     self._launch(kernels.impose, lines, [first, self.window, *overlap, self._field])
             touched = [self._overlaps, self._field, self.deepest, self._scale, _ROUNDING, self._x, self._contacts, self._moments]
             self._launch(kernels.touch, lines, [first, self.window, *touched])
             self._launch(kernels.find_centre, envs, [first, self.window, self._moments, self._y, self.centre, self.lost])
             if self._final:
-                before = self._smooth(first, envs, before, self._final, len(self._pyramid), imposes=False)
+                reach = self._smooth(first, envs, reach, self._final, len(self._pyramid), imposes=False)
             lifted = [self._rest, self._field, self.deepest, self._shallow, self._lowest, self._heights, self.lost]
-            self._launch(kernels.lift_off, lines, [first, self.window, wp.vec2i(*before), *lifted])
+            self._launch(kernels.lift_off, lines, [first, self.window, wp.vec2i(*reach), *lifted])
             shown = [self._rest, self._heights, self._contacts, self.centre]
             self._launch(kernels.without_lost, lines, [first, self.lost, *shown])
 
-    def _smooth(self, first: int, envs: int, before: np.ndarray, blur: _Gaussian, k: int, *, imposes: bool) -> np.ndarray:
-        """Launch the ``k``-th Gaussian of a field; returns how far it reaches.
+    def _smooth(self, first: int, envs: int, before: np.ndarray, gaussian: _Gaussian, k: int, *, imposes: bool) -> np.ndarray:
+        """Launch the ``k``-th Gaussian of the field, for ``envs`` environments from ``first`` on.
 
-        The field reaches ``before`` (x, y) nodes around the overlap.
+        The field reaches ``before`` (x, y) nodes around the overlap; returns how far it does afterwards. ``imposes``: the contact is
+        re-imposed too, by the rule ``unilateral``.
         """
         _, lines, count = self._field.shape
-        after = np.minimum(before + blur.reach, self._reaches[k])
+        after = np.minimum(before + gaussian.reach, self._reaches[k])
         threads = 1 if self.device.is_cpu else count
-        dim, reach = (envs, lines // kernels.ROWS, threads), [first, self.window, wp.vec2i(*before), wp.vec2i(*after)]
+        dim, reaches = (envs, lines // kernels.ROWS, threads), [first, self.window, wp.vec2i(*before), wp.vec2i(*after)]
         source = [0, self._field] if k else [first, self._overlaps]
-        self._launch(kernels.along_columns, dim, [*reach, blur.down, blur.down_band, threads, *source, self._spare])
-        imposed = [self._overlaps, int(imposes), self._field]
-        self._launch(kernels.along_rows, dim, [*reach, blur.across, blur.across_band, threads, self._spare_nodes, *imposed])
+        down, across = [gaussian.down, gaussian.down_band, threads], [gaussian.across, gaussian.across_band, threads]
+        self._launch(kernels.along_columns, dim, [*reaches, *down, *source, self._spare])
+        self._launch(kernels.along_rows, dim, [*reaches, *across, self._spare_nodes, self._overlaps, int(imposes), self._field])
         return after
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:

@@ -24,12 +24,12 @@ def png_bytes(rgb_u8: np.ndarray) -> bytes:
     return stream.getvalue()
 
 
-def write_png(path: Path, rgb_u8: np.ndarray) -> None:
+def write_png(path: str | Path, rgb_u8: np.ndarray) -> None:
     """Write ``png_bytes(rgb_u8)``. Raises the same."""
-    path.write_bytes(png_bytes(rgb_u8))
+    Path(path).write_bytes(png_bytes(rgb_u8))
 
 
-def read_png(path: Path) -> np.ndarray:
+def read_png(path: str | Path) -> np.ndarray:
     """The image as RGB, shape (H, W, 3), uint8."""
     from PIL import Image
 

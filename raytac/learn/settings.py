@@ -15,6 +15,10 @@ HISTORY = {"BalancePole": 3, "RollBall": 3}
 """Last observations that the policy is given, where it is more than one.
 
 What is known by touch alone shows in how it changes."""
+ENTROPY = {"LiftCube": 0.002}
+"""Weight of the entropy, where it is not 0.005.
+
+A reward that comes late lets a larger one widen the actions instead."""
 STEPS = {
     "PushCube": 1_000_000, "BalancePole": 4_000_000, "LiftCube": 6_000_000, "RollBall": 2_000_000, "InsertPeg": 20_000_000,
     "OpenDrawer": 20_000_000,
@@ -84,8 +88,8 @@ class PpoSettings:
     """Of generalised advantage estimation."""
     clip: float = 0.2
     """Bound of the ratio of probabilities."""
-    entropy: float = 0.005
-    """Weight of the entropy."""
+    entropy: float | None = None
+    """Weight of the entropy; the task's own if not given."""
     deviation: float = 1.0
     """Initial standard deviation of an action, whose range is −1 to 1.
 
@@ -112,7 +116,7 @@ class PpoSettings:
         check_number("deviation_floor", self.deviation_floor, f"(0, {DEVIATION_MOST}]")
         check_number("deviation", self.deviation, f"[{self.deviation_floor}, {DEVIATION_MOST}]")
         above, unit = dict.fromkeys(("learning_rate", "desired_kl", "clip"), "(0, inf)"), "[0, 1]"
-        for name, interval in {**above, "gamma": unit, "gae_lambda": unit, "entropy": "[0, inf)"}.items():
+        for name, interval in {**above, "gamma": unit, "gae_lambda": unit}.items():
             check_number(name, getattr(self, name), interval)
         for name in ("history", "steps", "launches"):
             if getattr(self, name) is not None:
@@ -120,6 +124,6 @@ class PpoSettings:
         for touch in parse_names(self.touch, "touch"):
             if touch not in ("none", "task"):
                 check_names("touch", touch.split("+"), MODALITIES)
-        for name, interval in {"minutes": "(0, inf)", "target": "[0, 1]"}.items():
+        for name, interval in {"minutes": "(0, inf)", "target": "[0, 1]", "entropy": "[0, inf)"}.items():
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), interval)

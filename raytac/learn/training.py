@@ -31,7 +31,7 @@ from raytac.io.folder import FolderLock
 from raytac.io.metrics import VERSIONED, Metric, read_metrics, versions, write_metrics
 from raytac.io.options import parse_names, parse_seeds
 from raytac.learn.evaluation import KINDS, Evaluation, Outcome, append_row, evaluate, keep_rows, segment_seed
-from raytac.learn.settings import DEVIATION_MOST, HISTORY, STEPS, PpoSettings
+from raytac.learn.settings import DEVIATION_MOST, ENTROPY, HISTORY, STEPS, PpoSettings
 from raytac.report.measure import machine
 
 _LOG = logging.getLogger("raytac")
@@ -72,7 +72,7 @@ class Training:
         self.ppo = PPO(
             actor, critic, storage,
             num_learning_epochs=args.epochs, num_mini_batches=args.minibatches, clip_param=args.clip, gamma=args.gamma,
-            lam=args.gae_lambda, entropy_coef=args.entropy, learning_rate=args.learning_rate, schedule="adaptive",
+            lam=args.gae_lambda, entropy_coef=self.settings["entropy"], learning_rate=args.learning_rate, schedule="adaptive",
             desired_kl=args.desired_kl, device=self.device,
         )  # fmt: skip
         self.ppo.train_mode()
@@ -104,11 +104,11 @@ class Training:
                 observation, rewards, dones, extras = self.env.step(self.ppo.act(self.observation))
                 self.ppo.process_env_step(observation, rewards, dones, extras)
                 self.observation = observation
-                now = {
+                present = {
                     "reward": rewards.mean(), "ended": dones.sum(), "succeeded": (extras["success"] * dones).sum(),
                     "failed": extras["failed"].sum(), "succeeding": extras["success"].mean(), **extras["log"],
                 }  # fmt: skip
-                sums = {name: value + sums.get(name, 0.0) for name, value in now.items()}
+                sums = {name: value + sums.get(name, 0.0) for name, value in present.items()}
             self.ppo.compute_returns(self.observation)
         totals = {name: float(value) for name, value in sums.items()}  # this waits
         ended, succeeded, failed = (totals[name] for name in ("ended", "succeeded", "failed"))
@@ -215,9 +215,9 @@ def train_policies(args: PpoSettings, out: Path, *, device: str = "auto") -> dic
 
 
 def _train(args: PpoSettings, touch: str, seed: int, folder: Path, device: str) -> None:
-    """One training, up to its steps, its target or the minutes; then the last evaluation."""
+    """Run one training up to its steps, its target or the minutes; then evaluate it for good."""
     start, total = time.perf_counter(), STEPS[args.task] if args.steps is None else args.steps
-    _checkpoint(folder, _settings(args, touch, seed), "cpu")
+    _checkpoint(folder, _settings(args, touch, seed), "cpu")  # of other settings it is refused, also where its training is done
     if _is_done(args, folder, total):
         _LOG.info("%s %s seed %s: done before, in %s", args.task, touch, seed, folder)
         return
@@ -263,8 +263,8 @@ def _train(args: PpoSettings, touch: str, seed: int, folder: Path, device: str) 
 def _gather(args: PpoSettings, out: Path, device: str, start: float) -> dict[str, Metric]:
     """Write ``metrics.json`` of what is done so far."""
     touches = parse_names(args.touch, "touch")
-    where = "gpu" if _device(device) == "cuda" else "cpu"
-    metrics: dict[str, Metric] = {"command": "train", "task": args.task, "device": where, **machine()}
+    kind = "gpu" if _device(device) == "cuda" else "cpu"
+    metrics: dict[str, Metric] = {"command": "train", "task": args.task, "device": kind, **machine()}
     for touch in touches:
         done = {k: out / touch / f"seed{k}" / "metrics.json" for k in parse_seeds(args.seeds)}
         rows = {k: read_metrics(path) for k, path in done.items() if path.exists()}
@@ -272,11 +272,11 @@ def _gather(args: PpoSettings, out: Path, device: str, start: float) -> dict[str
             key = f"{touch.replace('+', '_')}.seed{k}"
             metrics |= {f"{key}.{name}": value for name, value in row.items() if not name.startswith(("versions", "device"))}
         if touch == touches[0] and rows:
-            metrics[f"{where}.{args.task}.success"] = min(float(row["success"]) for row in rows.values())
-            metrics[f"{where}.{args.task}.minutes"] = max(float(row["minutes"]) for row in rows.values())
+            metrics[f"{kind}.{args.task}.success"] = min(float(row["success"]) for row in rows.values())
+            metrics[f"{kind}.{args.task}.minutes"] = max(float(row["minutes"]) for row in rows.values())
             speeds = [float(row["train_env_steps_per_s"]) for row in rows.values() if "train_env_steps_per_s" in row]
             if speeds:
-                metrics[f"{where}.train.env_steps_per_s"] = min(speeds)
+                metrics[f"{kind}.train.env_steps_per_s"] = min(speeds)
     metrics |= {"wall_s": time.perf_counter() - start} | versions((*VERSIONED, "gymnasium", "rsl_rl_lib", "torch"))
     write_metrics(out / "metrics.json", metrics)
     return metrics
@@ -294,12 +294,12 @@ def _checkpoint(folder: Path, settings: Mapping[str, Any], device: str) -> dict[
         return None
     try:
         saved = torch.load(path, map_location=device, weights_only=True)
-        kept, *_ = (saved[name] for name in ("settings", "steps", "iteration", "wall_s", "actor_state_dict"))
+        saved_settings, *_ = (saved[name] for name in ("settings", "steps", "iteration", "wall_s", "actor_state_dict"))
     except Exception as error:
         raise InputError("out", value=path, rule=f"must be a checkpoint of raytac train ({error})") from error
-    kept = {"physics": "rigid"} | kept  # a checkpoint from before there was a choice
-    if kept != settings:
-        other = {k: v for k, v in kept.items() if v != settings.get(k)}
+    saved_settings = {"physics": "rigid"} | saved_settings  # a checkpoint from before there was a choice
+    if saved_settings != settings:
+        other = {k: v for k, v in saved_settings.items() if v != settings.get(k)}
         raise InputError("out", value=folder, rule=f"holds a training of other settings, with {other}: name another folder")
     return saved
 
@@ -315,16 +315,8 @@ def _is_done(args: PpoSettings, folder: Path, total: int) -> bool:
 
 def _settings(args: PpoSettings, touch: str, seed: int) -> dict[str, Any]:
     """Settings that a checkpoint must agree in: all but where, how long and how evaluated."""
-    free = (
-        "seeds",
-        "touch",
-        "steps",
-        "minutes",
-        "target",
-        "processes",
-        "threads",
-        "episodes",
-        "evaluate_every",
-    )
-    kept = {name: value for name, value in asdict(args).items() if name not in free}
-    return kept | {"touch": touch, "seed": seed, "history": HISTORY.get(args.task, 1) if args.history is None else args.history}
+    free = ("seeds", "touch", "steps", "minutes", "target", "processes", "threads", "episodes", "evaluate_every")
+    bound = {name: value for name, value in asdict(args).items() if name not in free}
+    of_task = {"history": HISTORY.get(args.task, 1), "entropy": ENTROPY.get(args.task, 0.005)}
+    chosen = {name: value if bound[name] is None else bound[name] for name, value in of_task.items()}
+    return bound | {"touch": touch, "seed": seed} | chosen

@@ -98,13 +98,13 @@ class TactileObserver:
 
     def _perturbed_markers(self) -> MarkersConfig:
         """Marker model of the settings with the perturbation of the randomisation, or with its own."""
-        config, drawn = markers_config(self.settings.markers), self.randomization.markers
-        if drawn == MarkerPerturbation():
+        config, perturbation = markers_config(self.settings.markers), self.randomization.markers
+        if perturbation == MarkerPerturbation():
             return config
         if config.perturbation is not None:
             rule = "is given by the settings' markers already; give it to one of the two"
-            raise InputError("randomization.markers", value=drawn, rule=rule)
-        return replace(config, perturbation=drawn)
+            raise InputError("randomization.markers", value=perturbation, rule=rule)
+        return replace(config, perturbation=perturbation)
 
     def sensor_options(self) -> dict[str, Any]:
         """Keyword arguments of a ``TactileSensor`` with the outputs observed.
@@ -190,6 +190,10 @@ class TactileObserver:
         return self._finished({"wrench": self._scaled("wrench", wrench[rows])}, failed[rows], rows)
 
     def _finished(self, observed: dict[str, np.ndarray], failed: np.ndarray, rows: np.ndarray) -> dict[str, np.ndarray]:
+        """Check and stack what ``rows`` observed; the last observation of all environments.
+
+        ``observed``: an array (n, …) of each modality, of environments ``rows`` (n,), of which ``failed`` (n,) are left out.
+        """
         for name, values in observed.items():
             self._check_finite(name, values, failed, rows)
         if failed.any():
@@ -227,6 +231,7 @@ class TactileObserver:
         raise AssertionError(name)  # the settings know the names
 
     def _rgb(self, frame: TactileFrame, sensor: TactileSensor | None, rows: np.ndarray) -> np.ndarray:
+        """Images (n, H, W, 3), or half of their difference from rest about 127."""
         images = self._cut(frame.rgb)
         if self._drift is not None:
             images = self._drift.apply(images, envs=rows.tolist())
@@ -258,6 +263,7 @@ class TactileObserver:
         self._stale_rest[stale] = False
 
     def _cut(self, images: np.ndarray) -> np.ndarray:
+        """The observed piece of images as rendered, whole or cropped, in observed pixels."""
         layout, (width, height) = self.layout, self.layout.observed
         k, size = layout.downscale, images.shape[2:0:-1]
         if size == layout.rendered:
@@ -265,13 +271,15 @@ class TactileObserver:
             images = images[:, y : y + height * k, x : x + width * k]
         elif layout.crop is None or size != layout.crop[2:]:
             expected = "x".join(str(n) for n in layout.rendered)
-            raise InputError("frame.rgb", value=size, rule=f"must be {expected}, or a crop as in sensor_options")
+            how = "give its sensor or world **observer.sensor_options()"
+            raise InputError("frame.rgb", value=size, rule=f"must be {expected}, or the crop that is observed: {how}")
         if k > 1:
             blocks = images.reshape(len(images), height, k, width, k, 3)
             images = (blocks.sum(axis=(2, 4), dtype=np.uint32) + k * k // 2) // (k * k)
         return images.astype(np.uint8, copy=False)
 
     def _map(self, frame: TactileFrame, values: np.ndarray) -> np.ndarray:
+        """Means of values at nodes over the cells of the observed map."""
         if self._cells is None or self._cells.nodes != frame.surface.grid.shape:
             self._cells = CellMeans(frame.surface.grid.shape, self.settings.map_shape)
         return self._cells(values)
@@ -282,6 +290,7 @@ class TactileObserver:
     # --- last frames -----------------------------------------------------------------------------------------------------------
 
     def _check_finite(self, name: str, values: np.ndarray, failed: np.ndarray, rows: np.ndarray) -> None:
+        """Raise ``InputError`` for a value that is not finite where a row has not failed."""
         if values.dtype.kind != "f":
             return
         bad = ~np.isfinite(values.reshape(len(values), -1).sum(axis=1)) & ~failed
@@ -292,6 +301,7 @@ class TactileObserver:
             raise InputError(f"frame ({name})", value=numbers[~np.isfinite(numbers)][:3], rule=rule)
 
     def _last_of(self, name: str) -> np.ndarray:
+        """Last observation of a modality, (B, …); zeros before the first."""
         if name not in self._last:
             spec = self.arrays[name]
             self._last[name] = np.zeros((self.num_envs, *spec.shape), spec.dtype)
@@ -315,7 +325,7 @@ class CellMeans:
     """Means over (rows, columns) cells of values at nodes (B, Ny, Nx, …), each in one cell."""
 
     def __init__(self, nodes: tuple[int, int], cells: tuple[int, int]) -> None:
-        """Raises ``InputError`` if there are more cells than nodes."""
+        """Means over cells; ``InputError`` if there are more cells than nodes."""
         for name, n, m in zip(("rows", "columns"), nodes, cells, strict=True):
             if m > n:
                 raise InputError("map_shape", value=tuple(cells), rule=f"must not have more {name} than the pad's grid, {n}")

@@ -94,7 +94,8 @@ class DeviceMode(ABC):
         self.slab = Slab.from_spec(sensor)
         self.camera = Pinhole.from_spec(sensor.camera, resolution, self.slab)
         self._memory = total_memory(self.device)
-        self._fits = 0  # environments that are known to fit
+        self._known_to_fit = 0
+        """Environments of a batch that is known to fit into memory."""
         self._grid: PadGrid | None = None
         # One recording a batch size: a recording would replay at another size by scaling its launches, which is not what B means.
         self._frozen: dict[tuple[str, bool, int], Callable[..., Any]] = {}
@@ -105,7 +106,7 @@ class DeviceMode(ABC):
         self._is_running = False
         """True if nobody has waited for the images that were begun last."""
         self._last: Callable[[], _Launched | None] = lambda: None
-        """Reference to these images."""
+        """Weak reference to these images: whoever asked for them may have dropped them."""
         self._set_up()
 
     def _set_up(self) -> None:  # noqa: B027 (a mode may need nothing more)
@@ -175,7 +176,7 @@ class DeviceMode(ABC):
 
     def _check_batch(self, envs: int, grid: PadGrid) -> None:
         """Raise InputError for a batch that would not fit, before Dr.Jit ends the process over it."""
-        if grid is self._grid and envs <= self._fits:
+        if grid is self._grid and envs <= self._known_to_fit:
             return
         each, most = self.memory_per_env(grid), self.largest_batch(grid)
         if each and envs > most:
@@ -183,7 +184,7 @@ class DeviceMode(ABC):
             rule += f"{self._memory / 1e9:.1f} GB and an array at most 2^32 values; render in parts"
             raise InputError("number of environments", value=envs, rule=rule)
         if grid is self._grid:
-            self._fits = envs
+            self._known_to_fit = envs
 
     @property
     def _lit(self) -> bool:
@@ -227,10 +228,10 @@ class DeviceMode(ABC):
                 begun = self._begun(*rows)
 
         def images() -> OpticsImages:
-            some = None if begun is None else begun()
-            if whole and some is not None:
-                return some
-            return self._at_rest[dotted].repeated(surface.batch, pressed, some)
+            rendered = None if begun is None else begun()
+            if whole and rendered is not None:
+                return rendered
+            return self._at_rest[dotted].repeated(surface.batch, pressed, rendered)
 
         result = _Launched(images, partial(self.render, surface))
         self._last, self._is_running = ref(result), begun is not None
@@ -243,9 +244,9 @@ class DeviceMode(ABC):
             dr.sync_thread()
 
     def _pressed(self, surface: GelSurface, heights: np.ndarray, failed: np.ndarray) -> list[int]:
-        """Environments to render: a power of two.
+        """Numbers of the environments to render, padded to a power of two, or all.
 
-        The others are at rest, their dots where the first pad at rest had them.
+        The others show the image at rest: their gel is untouched, and their dots are where the first pad at rest had them.
         """
         rest = surface.grid.rest.astype(np.float32)
         differ = failed | surface.contact.any(axis=(1, 2)) | (heights != rest).any(axis=(1, 2))
@@ -310,7 +311,7 @@ class DeviceMode(ABC):
         return OpticsImages(**images)
 
     def _recorded(self, function: Callable[..., Any], heights: Float, contact: UInt8 | None, ink: Float | None) -> Any:
-        """``function(heights, contact, inputs)``, recorded once for each number of environments."""
+        """Call ``function(heights, contact, inputs)``, recorded once for each size of ``heights``."""
         key = function.__name__, ink is not None, dr.width(heights)
         if key not in self._frozen:
             self._frozen[key] = dr.freeze(function)

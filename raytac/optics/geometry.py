@@ -185,7 +185,7 @@ class CoatField:
 
         The tile's bounds bracket the hit, or those of the whole pad for rays too ``oblique`` to stay over a tile; the bracket is walked
         in steps of one cell until the ray is behind the surface, then refined by the secant rule (bilinear patches are nearly linear along
-        so short a way).
+        so short a distance).
         """
         mi, g = self.mi, self.layout
         ox, oy, oz = origin
@@ -213,9 +213,9 @@ class CoatField:
         for _ in range(2):
             z = za + (zb - za) * dr.clip(ga / dr.maximum(ga - gb, 1e-12), 0, 1)
             gz = gap(z)
-            front = gz > 0
-            za, ga = dr.select(front, z, za), dr.select(front, gz, ga)
-            zb, gb = dr.select(front, zb, z), dr.select(front, gb, gz)
+            is_before = gz > 0
+            za, ga = dr.select(is_before, z, za), dr.select(is_before, gz, ga)
+            zb, gb = dr.select(is_before, zb, z), dr.select(is_before, gb, gz)
         z = za + (zb - za) * dr.clip(ga / dr.maximum(ga - gb, 1e-12), 0, 1)
         return mi.Point3f(ox + (z - oz) * tx, oy + (z - oz) * ty, z)
 
@@ -224,9 +224,8 @@ class CoatField:
 
         Walks the shadow ray cell by cell and keeps the smallest clearance angle. ``tan_half`` is half the emitter's extent seen
         from ``p`` across the ray in the vertical plane: between −tan_half and +tan_half the share grows linearly, which is exact for
-        a rectangle cut by a straight horizon. The walk ends where no surface can reach the ray: ``rest`` is convex
-        towards the object (region of the camera side convex), so the clearance above it grows at least linearly from p to the
-        light, and only indentation deeper than that can block it. Where the bounds of the tile under the ray (its 3 × 3 neighbourhood)
+        a rectangle cut by a straight horizon. ``rest`` is concave, so the ray's clearance from it grows at least linearly from p to the
+        light, and only indentation deeper than that can block the ray. Where the bounds of the tile under the ray (its 3 × 3 neighbourhood)
         rule that out, the walk skips a whole tile; where the deepest point of the pad does, it ends.
         """
         mi, g = self.mi, self.layout
@@ -246,16 +245,17 @@ class CoatField:
         def walk(s: Any, least: Any) -> tuple[Any, Any]:
             x, y = p.x + s * ux, p.y + s * uy
             bound = dr.gather(mi.Float, self.deepest, self.tile(env, x, y))
-            free = above_p + dr.minimum(gain * s, gain * (s + edge)) > bound
-            clearance = self.z(env, x, y, ~free) - (p.z - s * rise)
-            least = dr.select(free, least, dr.minimum(least, clearance / s))
-            return s + dr.select(free, edge, step), least
+            is_clear = above_p + dr.minimum(gain * s, gain * (s + edge)) > bound
+            clearance = self.z(env, x, y, ~is_clear) - (p.z - s * rise)
+            least = dr.select(is_clear, least, dr.minimum(least, clearance / s))
+            return s + dr.select(is_clear, edge, step), least
 
         # Nothing in the way means a clearance of tan_half or more; a start of 1 would shade what lies right under an LED.
         _, least = dr.while_loop((mi.Float(step), mi.Float(tan_half)), inside, walk, label="shadow ray")
         return dr.clip(0.5 + 0.5 * least / tan_half, 0, 1)
 
     def _rest(self, x: Any, y: Any) -> Any:
+        """z of ``rest`` [m] at the node nearest to (x, y)."""
         mi, g = self.mi, self.layout
         ix = mi.UInt32(dr.clip((x - g.x0) / g.dx + 0.5, 0, g.nx - 1))
         iy = mi.UInt32(dr.clip((y - g.y0) / g.dy + 0.5, 0, g.ny - 1))
@@ -335,11 +335,11 @@ def see(mi: Any, field: CoatField, camera: Pinhole, envs: int, jitter: tuple[flo
     origin, (tx, ty) = camera.ray(u, v)
     p = field.camera_hit(env, origin, tx, ty, oblique=camera.lens.tilts or field.layout.tall)
     n = field.normal(env, p.x, p.y)
-    exit = None
+    leaving = None
     if camera.slab is not None:
         ax, ay = camera.slope(u, v)
-        exit = camera.slab.transmittance(mi, dr.rsqrt(1 + ax * ax + ay * ay)) / camera.slab.ior**2
-    return PixelSample(env, p, n, dr.normalize(mi.Vector3f(-tx, -ty, -1)), exit)
+        leaving = camera.slab.transmittance(mi, dr.rsqrt(1 + ax * ax + ay * ay)) / camera.slab.ior**2
+    return PixelSample(env, p, n, dr.normalize(mi.Vector3f(-tx, -ty, -1)), leaving)
 
 
 def seen_images(p: Any, n: Any, surface: GelSurface, camera: Pinhole, outputs: Sequence[str]) -> dict[str, np.ndarray]:

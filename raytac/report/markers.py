@@ -248,6 +248,7 @@ _LONGEST = 1.6
 
 
 def _look(model: str) -> tuple[str, str]:
+    """Label and colour of a model."""
     return _LOOK.get(model, (model, "#7f7f7f"))
 
 
@@ -294,8 +295,8 @@ def draw_arrows(
 def _magnification(rest: np.ndarray, displacement: np.ndarray) -> float:
     """Magnification of 1, 2, 5, 10 … for arrows of at most ``_LONGEST`` marker spacings."""
     longest = float(np.linalg.norm(displacement, axis=1).max(initial=0.0))
-    apart = np.linalg.norm(rest[:, None] - rest[None], axis=-1)
-    spacing = float(np.median(np.where(apart > 0, apart, np.inf).min(axis=1)))
+    distances = np.linalg.norm(rest[:, None] - rest[None], axis=-1)
+    spacing = float(np.median(np.where(distances > 0, distances, np.inf).min(axis=1)))
     steps = np.array([1, 2, 5, 10, 20, 50, 100], float)
     fits = steps[steps * longest <= _LONGEST * spacing]
     return float(fits.max(initial=1.0))
@@ -332,8 +333,8 @@ def write_arrows(path: Path, sensor: SensorSpec, frames: list[PressFrame], *, de
                     truth = markers.displacement[0]
                     axes.set_title(f"{load}: {label}, × {magnified:g}", fontsize=7)
                 else:
-                    off = 1e6 * np.linalg.norm(markers.displacement[0] - truth, axis=1).mean()
-                    axes.set_title(f"{label}, off by {off:.0f} µm", fontsize=7)
+                    error = 1e6 * np.linalg.norm(markers.displacement[0] - truth, axis=1).mean()
+                    axes.set_title(f"{label}, off by {error:.0f} µm", fontsize=7)
         figure.savefig(path, dpi=250)
 
 
@@ -365,9 +366,9 @@ def write_errors(path: Path, report: MotionReport) -> None:
             mean = [1e6 * rows[load].mean for load in loads]
             axes.bar(x, mean, 0.92 * width, color=colour, label=label)
             axes.plot(x, [1e6 * rows[load].p95 for load in loads], "_", color=colour, markersize=7)
-        still = {row.load: row.size for row in report.errors}
+        motion = {row.load: row.size for row in report.errors}
         x = np.arange(len(loads)) + 0.5 * len(models) * width
-        axes.bar(x, [1e6 * still[load] for load in loads], 0.92 * width, color="0.8", label="the motion itself")
+        axes.bar(x, [1e6 * motion[load] for load in loads], 0.92 * width, color="0.8", label="the motion itself")
         axes.axhline(30, color="0.4", linewidth=0.6, linestyle=(0, (4, 3)))
         axes.set_xticks(range(len(loads)), loads)
         axes.set_ylabel("distance [µm]: mean, 95 % (dash)")

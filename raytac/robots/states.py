@@ -117,7 +117,7 @@ class StateReader:
 
 
 class NumberWriter:
-    """Writes some numbers of one member of B states together.
+    """Write some numbers of one member of B states together.
 
     Attributes:
         array: Warp array (B, n), the next numbers; ``values`` is the same memory in NumPy.

@@ -54,7 +54,7 @@ class Player:
         self._orders: list[str] = ["show"]
         """``show``, ``play``, ``pause``, ``step``, ``reset``, ``load`` in the order they came."""
         self._make: Callable[[], Session] | None = None
-        """Makes the session that the next ``load`` takes."""
+        """Make the session that the next ``load`` takes."""
         self._is_closing = False
         self._status = Status()
         self._thread = threading.Thread(target=self._work, name="raytac-view-player", daemon=True)

@@ -66,7 +66,7 @@ class PressSession:
         self._sensor, self._stages = sensor, len(scene.trajectory)
         self._is_drivable = scene.object.kind != "none" and scene.object.dynamics != "affine"
         if self._is_drivable:
-            # One more stage, never played: it makes a soft pad keep as much of the object as the sliders can bring near the gel.
+            # One more stage, never played: a soft pad then keeps as much of the object as the sliders can bring near the gel.
             scene = replace(scene, trajectory=(*scene.trajectory, StageSpec("indent", force=_STRONGEST)))
         self._pad = sensor.load(scene)
         self.title = f"{scene.name} · {sensor.spec.name} · {sensor.label}"
@@ -106,7 +106,7 @@ class PressSession:
             control = next(c for c in self.controls if c.name == name)
             self._targets.pop(control.instead_of, None)
             self._targets[name] = value
-        # In the order of a press, whatever the order of the hands: an object that is sheared before it is pressed feels nothing.
+        # In the order of a press, whatever slider was moved first: an object that is sheared before it is pressed feels nothing.
         stages = [self._stage_to(control.name) for control in self.controls if control.name in self._targets]
         self._states = chain.from_iterable(self._pad.follow(stage, steps) for stage, steps in stages if stage is not None)
 
@@ -142,17 +142,17 @@ class PressSession:
     def _stage_to(self, name: str) -> tuple[StageSpec | None, int]:
         """Stage and number of states to the target of the control ``name``; None if it is there."""
         now, target = self._places(), self._targets[name]
-        off = target - now[name]
-        if abs(off) <= _NEAR[name]:
+        change = target - now[name]
+        if abs(change) <= _NEAR[name]:
             return None, 0
         if name in ("shear_x", "shear_y"):
-            # Both are one stage; a side that nobody holds stays where it is.
+            # Both are one stage; the one whose slider was not moved stays where it is.
             ends = tuple(self._targets.get(side, now[side]) for side in ("shear_x", "shear_y"))
             distance = np.hypot(ends[0] - now["shear_x"], ends[1] - now["shear_y"])
             return StageSpec("shear", shear=(1e-3 * ends[0], 1e-3 * ends[1])), _steps(distance / _STRIDE_MM)
         if name == "twist":
-            return StageSpec("twist", twist=float(np.radians(target))), _steps(off / _TURN_DEG)
-        steps = _steps(off / (_STRIDE_MM if name == "depth" else _PUSH))
+            return StageSpec("twist", twist=float(np.radians(target))), _steps(change / _TURN_DEG)
+        steps = _steps(change / (_STRIDE_MM if name == "depth" else _PUSH))
         if target == 0.0:
             return StageSpec("release"), steps
         return (StageSpec("indent", depth=1e-3 * target) if name == "depth" else StageSpec("indent", force=target)), steps
@@ -171,6 +171,7 @@ class PressSession:
         }
 
     def _object_solids(self) -> tuple[Solid, ...]:
+        """The object as solids of its own frame; half-spaces as squares."""
         if not self._pad.parts:
             return ()
         soft = self._soft_object()
@@ -197,9 +198,10 @@ class PressSession:
         return vertices[0], faces
 
     def _drawn(self, frame: TactileFrame) -> Snapshot:
+        """All that the page shows of a frame and of the present reading."""
         name, surface = self._sensor.spec.name, frame.surface
         pads = {name: pad_view(frame, self._grid, np.eye(4), rest_rgb=self._rest)}
-        spent = frame.time_ms  # of a frame whose images were waited for
+        time_ms = frame.time_ms  # after ``pad_view``, which waits for the images
         poses = {solid.name: self._state.pad_from_object[0] for solid in self.solids if solid.name.startswith("object")}
         reshaped: dict[str, np.ndarray] = {}
         if isinstance(self._pad, SoftPad):
@@ -216,7 +218,7 @@ class PressSession:
             controls=controls,
             facts=self._facts(frame),
             warning=narrow_warning(frame),
-            time_ms={"image": sum(spent.values()), **spent},
+            time_ms={"image": sum(time_ms.values()), **time_ms},
             handle=self._handle_place(),
         )
 
@@ -230,8 +232,8 @@ class PressSession:
 
     def _facts(self, frame: TactileFrame) -> dict[str, str]:
         state, surface = self._state, frame.surface
-        where = "held by the sliders" if self._targets else f"{state.kind} {100.0 * state.fraction:.0f} %"
-        facts = {"stage": where}
+        stage = "held by the sliders" if self._targets else f"{state.kind} {100.0 * state.fraction:.0f} %"
+        facts = {"stage": stage}
         if self._is_drivable:
             facts["depth"] = f"{1e3 * float(state.depth[0]):.3f} mm"
         facts["deepest imprint"] = f"{1e3 * float(np.nanmax(surface.indentation[0])):.3f} mm"
@@ -240,5 +242,6 @@ class PressSession:
         return facts
 
 
-def _steps(share: float) -> int:
-    return max(int(np.ceil(abs(share))), 1)
+def _steps(strides: float) -> int:
+    """Whole number of states for so many of the largest changes, at least one."""
+    return max(int(np.ceil(abs(strides))), 1)

@@ -57,7 +57,7 @@ class Control:
 
 
 def check_targets(controls: Sequence[Control], targets: Mapping[str, float]) -> None:
-    """Raises ``InputError`` for a target of no control, or beyond its control's ends."""
+    """Raise ``InputError`` for a target of no control, or beyond its control's ends."""
     known = {control.name: control for control in controls}
     for name, value in targets.items():
         if name not in known:

@@ -1,6 +1,4 @@
-"""Soft pads of a world: one contact solver for all gels and the bodies they touch.
-
-And what is read of it.
+"""Soft pads of a world: one contact solver for all gels and bodies, and its readings.
 
 MuJoCo moves the robot and the rest. Every ``soft_timestep`` it steps first, with the forces of the pads on the robot. Then the solver
 follows: cases and MuJoCo's bodies are driven to MuJoCo's poses, bodies of the solver move freely and are mirrored in MuJoCo as mocap
@@ -148,28 +146,32 @@ class SoftPads:
         sums = self.soft.world.sums.host
         failed |= due & ~(np.isfinite(sums["force"]).all(axis=(1, 2)) & np.isfinite(sums["torque"]).all(axis=(1, 2)))
         for k, mounted in enumerate(self.composed.sensors):
-            turn, world = cases[:, k, :3, :3], self.soft.wrench(mounted.name)
-            split = [np.einsum("bji,bj->bi", turn, world[:, at : at + 3]) for at in (0, 3)]
-            self._wrench[mounted.name][due] = np.concatenate(split, axis=1)[due]
+            world_from_pad, wrench = cases[:, k, :3, :3], self.soft.wrench(mounted.name)
+            force, torque = (np.einsum("bji,bj->bi", world_from_pad, axes) for axes in (wrench[:, :3], wrench[:, 3:]))
+            self._wrench[mounted.name][due] = np.concatenate([force, torque], axis=1)[due]
         return report
 
     def _conclude(self, reports: Sequence[SceneReport], failed: np.ndarray) -> None:
         """Report all steps of the solver in a control step, and freeze what failed (B,)."""
-        whole = reduce(SceneReport.then, reports)
-        failed |= ~whole.last_converged
+        total = reduce(SceneReport.then, reports)
+        failed |= ~total.last_converged
         if (failed & ~self.soft.failed).any():
             self.soft.fail(failed)
-        self.report = {key: np.broadcast_to(getattr(whole, key), len(failed)).copy() for key in _REPORT}
-        self._unconverged += whole.unconverged
+        self.report = {key: np.broadcast_to(getattr(total, key), len(failed)).copy() for key in _REPORT}
+        self._unconverged += total.unconverged
 
     def _due(
         self, cases: np.ndarray, driven: dict[str, np.ndarray], since: np.ndarray, interval: int, *, last: bool
     ) -> np.ndarray:
-        """Environments (B,) in which the solver steps now.
+        """Environments (B,) in which the solver steps now: every ``interval`` steps of MuJoCo.
 
-        ``since`` (B,) steps of MuJoCo after the last time.
+        Where a contact is about to begin it steps earlier, so that MuJoCo has the contact's force before the bodies overlap far.
 
-        Before a contact begins, it steps early, so that MuJoCo has the contact's force before the bodies overlap far.
+        Args:
+            cases, driven: present poses of the cases (B, S, 4, 4) and of driven bodies (B, 4, 4) by name, world frame.
+            since: steps of MuJoCo since the solver stepped, (B,).
+            interval: steps of MuJoCo in one of the solver.
+            last: True in the last step of MuJoCo in a control step, with which all of them step.
         """
         due = (since == interval) | last
         if self._inputs is not None and not due.all():
@@ -187,9 +189,9 @@ class SoftPads:
 
     def reading(self, name: str, grid: PadGrid, failed: np.ndarray, envs: Sequence[int] | None = None) -> PadReading:
         """Surface and forces of one sensor, for the environments named, one row each; None is all."""
-        left_out = failed if envs is None else failed | ~np.isin(np.arange(len(failed)), envs)
-        reading = self.soft.reading(name, grid, left_out)
-        failed = failed | (reading.failed & ~left_out)
+        unread = failed if envs is None else failed | ~np.isin(np.arange(len(failed)), envs)
+        reading = self.soft.reading(name, grid, unread)
+        failed = failed | (reading.failed & ~unread)
         wrench = np.where(failed[:, None], np.nan, self._wrench[name])
 
         def traction(_: GelSurface) -> np.ndarray:
@@ -210,11 +212,11 @@ class SoftPads:
             if name not in self._markers:
                 self._markers[name] = CoatMarkers(mesh, markers, len(failed), device)
             displacement = self._markers[name].launch(shown.coat)
-        lost = failed | self.soft.failed
-        wrench = np.where(lost[:, None], np.nan, self._wrench[name])
+        failed = failed | self.soft.failed
+        wrench = np.where(failed[:, None], np.nan, self._wrench[name])
         return WarpFrame(
             wp.array(wrench, dtype=wp.float64, device=device),
-            wp.array(~lost, dtype=wp.bool, device=device),
+            wp.array(~failed, dtype=wp.bool, device=device),
             shown.height,
             shown.contact,
             displacement,

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 DEPTHS = ("force", "geometry")
 """Depths of an imprint: where the load law gives MuJoCo's force, or MuJoCo's overlap."""
 _HALVINGS = 50
+"""Steps of the bisection for the depth of a load: more than float64 can tell apart."""
 
 
 class TactileReader:
@@ -95,11 +96,11 @@ class TactileReader:
             model, sensors=sensors, touches=touches, keyframe=keyframe, allow_overlap=allow_overlap, own_contact=False
         )
         self.failed = np.zeros(num_envs, bool)
-        sensors_, bodies = self.composed.sensors, self.composed.touched
-        self._frames = SensorFrames(sensors_, num_envs=num_envs, seed=seed, physics=config, **settings)
+        pads, bodies = self.composed.sensors, self.composed.touched
+        self._frames = SensorFrames(pads, num_envs=num_envs, seed=seed, physics=config, **settings)
         shapes = [body.parts for body in bodies]
-        self._surfaces = PadSurfaces({mounted.name: mounted.spec.gelpad for mounted in sensors_}, shapes, num_envs)
-        self._faces = {mounted.name: BondedFaces.on_cpu([mounted.spec.gelpad], shapes) for mounted in sensors_}
+        self._surfaces = PadSurfaces({mounted.name: mounted.spec.gelpad for mounted in pads}, shapes, num_envs)
+        self._faces = {mounted.name: BondedFaces.on_cpu([mounted.spec.gelpad], shapes) for mounted in pads}
         self._body_index = np.array([body.index for body in bodies], int)
         # Entries of one body move together: MuJoCo's force is on the body.
         self._groups = {int(index): np.flatnonzero(self._body_index == index) for index in np.unique(self._body_index)}
@@ -112,7 +113,7 @@ class TactileReader:
                 [tuple(part for i in group for part in shapes[i]) for group in self._groups.values()],
                 num_envs=num_envs,
             )
-            for mounted in sensors_
+            for mounted in pads
         }
 
     def reset(self, envs: np.ndarray | list[int] | None = None) -> None:
@@ -140,9 +141,9 @@ class TactileReader:
         states = checked_states(self.model, self.model, datas, len(self.failed))
         for b in chosen_envs(envs, len(states)):
             self.failed[b] = not np.isfinite(states[b].qpos.sum() + states[b].qvel.sum())
-        mounted = {one.name: one for one in self.composed.sensors}
+        pads = {mounted.name: mounted for mounted in self.composed.sensors}
         return self._frames.observe(
-            lambda name, grid, rows: self._reading(mounted[name], grid, states, rows), self.failed, sensors, envs
+            lambda name, grid, rows: self._reading(pads[name], grid, states, rows), self.failed, sensors, envs
         )
 
     def _reading(
@@ -173,14 +174,14 @@ class TactileReader:
             for k in np.flatnonzero((geoms == gel).any(axis=1)).tolist():
                 mujoco.mj_contactForce(self.model, data, k, local)
                 contact = data.contact[k]
-                first = int(geoms[k, 0]) == gel
+                gel_is_first = int(geoms[k, 0]) == gel
                 # MuJoCo's force is on the second geom.
-                axes = contact.frame.reshape(3, 3) * (-1.0 if first else 1.0)
+                axes = contact.frame.reshape(3, 3) * (-1.0 if gel_is_first else 1.0)
                 force, torque = local[:3] @ axes, local[3:] @ axes
                 torque = torque + np.cross(contact.pos - origin, force)
                 on_pad = np.concatenate([force @ rotation, torque @ rotation])
                 wrench[b] += on_pad
-                group = self._group_of.get(int(self.model.geom_bodyid[geoms[k, 1 if first else 0]]))
+                group = self._group_of.get(int(self.model.geom_bodyid[geoms[k, 1 if gel_is_first else 0]]))
                 if group is not None:
                     load[b, group] -= on_pad[2]
         return wrench, load
@@ -190,17 +191,16 @@ class TactileReader:
         sound, gelpad = np.flatnonzero(~failed), mounted.spec.gelpad
         firsts = [int(group[0]) for group in self._groups.values()]
         poses = pad_from_body[sound][:, None, firsts]
-        near = self._search[mounted.name].contacts(poses, sound, gelpad.thickness)
-        wanted = np.maximum(load[near.env, near.body], 0.0)
-        law = LoadTables(near, np.full(len(near), gelpad.thickness))
-        low, high = np.zeros(len(near)), np.maximum(near.depth + near.clearance, 0.0)
+        contacts = self._search[mounted.name].contacts(poses, sound, gelpad.thickness)
+        target = np.maximum(load[contacts.env, contacts.body], 0.0)
+        law = LoadTables(contacts, np.full(len(contacts), gelpad.thickness))
+        low, high = np.zeros(len(contacts)), np.maximum(contacts.depth + contacts.clearance, 0.0)
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
-            above = law.force(middle)[0] > wanted
-            low, high = np.where(above, low, middle), np.where(above, middle, high)
-        loaded = wanted > 0.0
-        shift = np.where(loaded, near.depth - low, np.maximum(near.depth, 0.0))
+            is_above = law.force(middle)[0] > target
+            low, high = np.where(is_above, low, middle), np.where(is_above, middle, high)
+        lift = np.where(target > 0.0, contacts.depth - low, np.maximum(contacts.depth, 0.0))
         for group, entries in enumerate(self._groups.values()):
-            some = near.body == group
+            of_group = contacts.body == group
             for i in entries:
-                pad_from_body[near.env[some], i, 2, 3] += shift[some]
+                pad_from_body[contacts.env[of_group], i, 2, 3] += lift[of_group]

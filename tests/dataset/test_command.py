@@ -106,6 +106,12 @@ def test_what_cannot_be_exported_is_refused_before_rendering(
     assert not (tmp_path / "data").exists()
 
 
+def test_a_sweep_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["dataset", "--out", str(tmp_path / "data")]) == 2
+    assert "sweep: must be given" in (said := capsys.readouterr().err) and "demo" in said
+    assert not (tmp_path / "data").exists()
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -25,8 +25,9 @@ from raytac.gel.surface import GelSurface, make_grid
 from raytac.io.images import read_png, write_png
 from raytac.optics import RayTraced
 from raytac.report.markers import run_calibrate_markers
-from raytac.report.real import RealSettings, real_splits, table_text
+from raytac.report.real import real_splits, table_text
 from raytac.report.real_calibration import run_calibrate_optics
+from raytac.report.real_fits import RealSettings
 from raytac.report.real_imprints import imprint_metrics, imprint_table
 from raytac.report.real_scores import noise_floor, outliers, press_rows, press_scores, summary
 from raytac.sensor import TactileSensor

@@ -8,8 +8,8 @@ A = L Lᵀ is factored in each Newton iteration. By Woodbury's identity
 
 The second form needs no inverse of S, which is not regular where friction is missing. An affine body is 10⁶ times as stiff against strain
 as against motion: its unknowns are Lᵀ x and its rows L⁻¹ q here, for which K = 1; otherwise the difference would be lost to rounding.
-W is computed in double precision by one block of threads an environment. An environment with more contact nodes than there is room
-for is marked as one that does not fit: with part of its contacts the identity is of little use.
+W is computed in double precision by one block of threads an environment (``dense.py``). An environment with more contact nodes than there
+is room for is marked as one that does not fit: with part of its contacts the identity is of little use.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -19,17 +19,22 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.arrays import FloatArray2d, IntArray, IntArray2d, MatArray2d, SingleArray3d, VecArray2d
+from ipc.arrays import FloatArray2d, FloatArray3d, IntArray, IntArray2d, MatArray2d, SingleArray3d, VecArray2d
 from ipc.contact.contacts import Contacts, mat34d, rows_of
-from ipc.solver.affine_elimination import Elimination, affine_first, affine_part, finish_elimination
+from ipc.solver.affine_elimination import Elimination, finish_elimination
 from ipc.solver.blocks import wait_for_block
 from ipc.solver.linear import SystemView, row_column
+from ipc.solver.preconditioners.dense import PANEL, factor, gram, solve, solve_identity
 
 wp.set_module_options({"enable_backward": False})
 
 mat1212d = wp.types.matrix(shape=(12, 12), dtype=wp.float64)
 LANES = 256
 """Threads on CUDA for the small system of an environment; the size of all blocks."""
+_APART = 64
+"""Threads a body, of which one works: few then share a cache, since registers do not do."""
+_ENTRIES = 78
+"""Of the upper half of a body's 12 × 12 matrix."""
 
 
 @wp.struct
@@ -61,9 +66,7 @@ class Small:
     ``touched``, ``slot`` (B, s): mark of a surface node that touches, and its place among the contact nodes.
     ``count`` (B,): contact nodes; more than m do not fit.    ``pads`` (B,): those of pads, the first ones.    ``node`` (B, m).
     ``known`` (B,): pad nodes of which ``k`` is K; −1 after ``node`` has changed.
-    ``a`` (B, m, m): the upper half of S, then (K + S)⁻¹.    ``k`` (B, m, m): K.
-    ``product`` (B, m, m), ``row``, ``column`` (B, m): work space.
-    ``w`` (B, 3m, 3m): W [N/m].
+    ``s`` (B, 3m, 3m): the upper half of S, zero after W was computed.    ``k`` (B, 3m, 3m): K.    ``w`` (B, 3m, 3m): W [N/m].
     ``t``, ``force`` (B, 3m): J K_0⁻¹ r [m], on affine nodes L⁻¹ r, and W t [N].
     ``root`` (B, A, 4): blocks of an affine node's row of L⁻¹, at the nodes of its body.
     """
@@ -74,12 +77,9 @@ class Small:
     pads: IntArray
     node: IntArray2d
     known: IntArray
-    a: wp.array3d(dtype=wp.mat33d)
-    k: wp.array3d(dtype=wp.mat33d)
-    product: wp.array3d(dtype=wp.mat33d)
-    row: MatArray2d
-    column: MatArray2d
-    w: wp.array3d(dtype=wp.float64)
+    s: FloatArray3d
+    k: FloatArray3d
+    w: FloatArray3d
     t: FloatArray2d
     force: FloatArray2d
     root: wp.array3d(dtype=wp.mat33d)
@@ -177,11 +177,17 @@ def slot_of(env: wp.int32, rest: Rest, small: Small, first: wp.int32) -> wp.int3
 
 
 @wp.func
-def scaled_part(
-    system: SystemView, verts: wp.vec4i, row: mat34d, env: wp.int32, rest: Rest, small: Small, first: wp.int32
-) -> mat34d:
-    """L⁻¹ q of a row at the nodes of an affine body."""
-    g, scaled = affine_part(system, verts, row, env, first), mat34d()
+def add_block(env: wp.int32, small: Small, i: wp.int32, j: wp.int32, q: wp.vec3d, g: wp.vec3d):
+    """S += q gᵀ between the unknowns of contact nodes i <= j."""
+    for c in range(3):
+        for d in range(3):
+            wp.atomic_add(small.s, env, 3 * i + c, 3 * j + d, q[c] * g[d])
+
+
+@wp.func
+def scaled_row(g: mat34d, env: wp.int32, rest: Rest, small: Small, first: wp.int32) -> mat34d:
+    """L⁻¹ g of a row at the nodes of the affine body whose first node is ``first``."""
+    scaled = mat34d()
     for i in range(4):
         v = wp.vec3d()
         for j in range(i + 1):
@@ -191,134 +197,85 @@ def scaled_part(
     return scaled
 
 
-@wp.func
-def add_product(env: wp.int32, small: Small, i: wp.int32, q: wp.vec3d, a: wp.int32, g: mat34d):
-    """S += q gᵀ between a node's unknowns and the nodes of an affine body, which come after it."""
-    for m in range(4):
-        wp.atomic_add(small.a, env, i, a + m, wp.outer(q, row_column(g, m)))
-
-
-@wp.func
-def add_own(env: wp.int32, small: Small, a: wp.int32, blocks: mat1212d):
-    """S += the upper half of Σ g gᵀ of an affine body in slot a; −1 for none."""
-    if a >= 0:
-        for m in range(4):
-            for n in range(m, 4):
-                block = wp.mat33d()
-                for i in range(3):
-                    for j in range(3):
-                        block[i, j] = blocks[3 * m + i, 3 * n + j]
-                wp.atomic_add(small.a, env, a + m, a + n, block)
-
-
-@wp.func
-def own_product(g: mat34d) -> mat1212d:
-    """The upper half of g gᵀ."""
-    blocks = mat1212d()
-    for m in range(4):
-        for n in range(m, 4):
-            for i in range(3):
-                for j in range(3):
-                    blocks[3 * m + i, 3 * n + j] = g[i, m] * g[j, n]
-    return blocks
-
-
 @wp.kernel
-def add_rows(system: SystemView, contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
-    """The upper half of S = Σ q qᵀ between the contact nodes, in the frames of their bodies.
+def add_rows(contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
+    """The upper half of S = Σ q qᵀ between the contact nodes, without Σ g gᵀ of affine bodies.
 
-    A thread sums what its rows give to one affine body, to which nearly all of them belong, and adds that at once.
+    ``scaled_row`` of the contacts becomes L⁻¹ g at the row's affine body; a second one is among the row's nodes.
     """
     env, lane = wp.tid()
     if active[env] == 0 or not fits(small, env):
         return
-    place, own = wp.int32(-1), mat1212d()
     for r in range(lane, rows_of(contacts, env), lanes):
         if contacts.concave[env, r] != 0:
             continue
-        verts, row = contacts.row_verts[env, r], contacts.row[env, r]
-        one, other = affine_first(system, verts, -1), wp.int32(-1)
-        if one >= 0:
-            other = affine_first(system, verts, one)
-        a, b = slot_of(env, rest, small, one), slot_of(env, rest, small, other)
-        if a < 0:
-            one, a, b = other, b, wp.int32(-1)
-        g, h = mat34d(), mat34d()
-        if a >= 0:
-            g = scaled_part(system, verts, row, env, rest, small, one)
-            if a != place:
-                add_own(env, small, place, own)
-                place, own = a, mat1212d()
-            own += own_product(g)
-        if b >= 0:
-            h = scaled_part(system, verts, row, env, rest, small, other)
-            add_own(env, small, b, own_product(h))
-            for m in range(4):
-                if a < b:
-                    add_product(env, small, a + m, row_column(g, m), b, h)
-                else:
-                    add_product(env, small, b + m, row_column(h, m), a, g)
+        nodes, row, first = contacts.row_nodes[env, r], contacts.node_row[env, r] + mat34d(), contacts.row_body[env, r] + 0
+        a, g = wp.int32(-1), mat34d()
+        if first >= 0:
+            a = slot_of(env, rest, small, first)
+            g = scaled_row(contacts.body_row[env, r], env, rest, small, first)
+        contacts.scaled_row[env, r] = g
+        if nodes[0] >= 0:
+            if rest.affine[nodes[0]] >= 0:
+                row = scaled_row(row, env, rest, small, nodes[0])
         for k in range(4):
-            s = surface_of_vertex(system, rest, verts[k])
-            if s >= 0:
-                qi = wp.transpose(system.R[env, system.verts.body[verts[k]]]) * row_column(row, k)
-                if wp.length_sq(qi) > wp.float64(0.0):
-                    i = small.slot[env, s]
+            if nodes[k] >= 0:
+                q = row_column(row, k)
+                if rest.surface[nodes[k]] >= 0 and wp.length_sq(q) > wp.float64(0.0):
+                    i = small.slot[env, rest.surface[nodes[k]]]
                     for m in range(4):
-                        other_s = surface_of_vertex(system, rest, verts[m])
-                        if other_s >= 0:
-                            j = small.slot[env, other_s]
-                            if i <= j:
-                                qj = wp.transpose(system.R[env, system.verts.body[verts[m]]]) * row_column(row, m)
-                                wp.atomic_add(small.a, env, i, j, wp.outer(qi, qj))
+                        if nodes[m] >= 0:
+                            h = row_column(row, m)
+                            if rest.surface[nodes[m]] >= 0 and wp.length_sq(h) > wp.float64(0.0):
+                                j = small.slot[env, rest.surface[nodes[m]]]
+                                if i <= j:
+                                    add_block(env, small, i, j, q, h)
                     if a >= 0:
-                        add_product(env, small, i, qi, a, g)
-                    if b >= 0:
-                        add_product(env, small, i, qi, b, h)
-    add_own(env, small, place, own)
+                        for m in range(4):
+                            if i < a + m:
+                                add_block(env, small, i, a + m, q, row_column(g, m))
+                            else:
+                                add_block(env, small, a + m, i, row_column(g, m), q)
 
 
-@wp.func
-def invert_small(
-    a: wp.array3d(dtype=wp.mat33d), small: Small, env: wp.int32, m: wp.int32, lane: wp.int32, lanes: wp.int32
-) -> wp.bool:
-    """Inverts the positive definite blocks ``a`` in place (Gauss-Jordan, without pivoting).
+@wp.kernel
+def add_bodies(contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
+    """S += the upper half of Σ g gᵀ of each affine body's rows, one block of threads a body.
 
-    All lanes of the environment work on it and get the same result: False where a pivot is not positive.
+    Nearly all rows belong to a body: its twelve unknowns are added up by entries of S, and not by rows, which would all meet there.
     """
-    wait_for_block()
-    for k in range(m):
-        pivot = a[env, k, k]
-        if not (wp.determinant(pivot) > wp.float64(0.0) and wp.trace(pivot) > wp.float64(0.0)):
-            return False
-        inverse = wp.inverse(pivot)
-        for i in range(lane, m, lanes):
-            small.column[env, i] = a[env, i, k]
-            small.row[env, i] = inverse * a[env, k, i]
-        wait_for_block()
-        for e in range(lane, m * m, lanes):
-            i = e / m
-            j = e - m * i
-            if i == k and j == k:
-                a[env, i, j] = inverse
-            elif i == k:
-                a[env, i, j] = small.row[env, j]
-            elif j == k:
-                a[env, i, j] = -(small.column[env, i] * inverse)
-            else:
-                a[env, i, j] = a[env, i, j] - small.column[env, i] * small.row[env, j]
-        wait_for_block()
-    return True
+    env, body, lane = wp.tid()
+    if active[env] == 0 or not fits(small, env):
+        return
+    first = rest.affine_node[4 * body]
+    if small.touched[env, rest.surface[first]] == 0:
+        return
+    place, rows = 3 * small.slot[env, rest.surface[first]], rows_of(contacts, env)
+    # Threads take an entry of the upper half each, several the same one with some of the rows.
+    parts = wp.max(1, lanes / _ENTRIES)
+    for e in range(lane, parts * _ENTRIES, lanes):
+        part = e / _ENTRIES
+        i, j = wp.int32(0), e - part * _ENTRIES
+        while j >= 12 - i:
+            j -= 12 - i
+            i += 1
+        j += i
+        total = wp.float64(0.0)
+        for r in range(part, rows, parts):
+            if contacts.row_body[env, r] == first and contacts.concave[env, r] == 0:
+                g = contacts.scaled_row[env, r]
+                total += g[i % 3, i / 3] * g[j % 3, j / 3]
+        wp.atomic_add(small.s, env, place + i, place + j, total)
 
 
 @wp.kernel
 def factor_affine(rest: Rest, system: SystemView, active: IntArray, small: Small):
-    """L⁻¹ of every affine body.
+    """L⁻¹ of every affine body, by the first of some threads.
 
     Where its matrix is not positive definite, that of the mean diagonal of its blocks.
     """
-    env, body = wp.tid()
-    if active[env] == 0:
+    env, body, lane = wp.tid()
+    if active[env] == 0 or lane > 0:
         return
     first = 4 * body
     A = mat1212d()
@@ -371,86 +328,77 @@ def factor_affine(rest: Rest, system: SystemView, active: IntArray, small: Small
 
 
 @wp.func
-def rest_block(rest: Rest, a: wp.int32, b: wp.int32) -> wp.mat33d:
-    """The block of K_0⁻¹ between two nodes of pads."""
-    block = wp.mat33d()
-    part = rest.part[a]
-    if part == rest.part[b]:
-        for i in range(3):
-            for j in range(3):
-                block[i, j] = wp.float64(rest_entry(rest, part, rest.unknown[a] + i, rest.unknown[b] + j))
-    return block
+def padded_size(nodes: wp.int32) -> wp.int32:
+    """Unknowns of contact nodes, and up to the next multiple of ``PANEL``."""
+    return PANEL * ((3 * nodes + PANEL - 1) / PANEL)
 
 
-@wp.kernel
+@wp.func
+def find_stiffness(rest: Rest, small: Small, env: wp.int32, lane: wp.int32, lanes: wp.int32) -> wp.bool:
+    """K = (J C Jᵀ)⁻¹ of the pads' contact nodes; False where a pivot is not positive."""
+    n = 3 * small.pads[env]
+    size = padded_size(small.pads[env])
+    for e in range(lane, size * size, lanes):
+        i = e / size
+        j = e - size * i
+        value = wp.float64(0.0)
+        if i == j:
+            value = wp.float64(1.0)
+        if i < n and j < n:
+            value = wp.float64(0.0)
+            a, b = small.node[env, i / 3], small.node[env, j / 3]
+            if rest.part[a] == rest.part[b]:
+                value = wp.float64(rest_entry(rest, rest.part[a], rest.unknown[a] + i % 3, rest.unknown[b] + j % 3))
+        small.w[env, i, j] = value
+    if not factor(small.w, env, size, lane, lanes):
+        return False
+    solve_identity(small.w, small.k, env, size, lane, lanes)
+    gram(small.k, small.k, True, small.w, env, size, lane, lanes)
+    for e in range(lane, size * size, lanes):
+        small.k[env, e / size, e % size] = small.w[env, e / size, e % size]
+    wait_for_block()
+    return True
+
+
+@wp.kernel(launch_bounds=(LANES, 2))
 def factor_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
-    """W from S, one block of threads an environment; leaves ``a`` zero for the next S."""
+    """W = K − (U⁻ᵀ K)ᵀ (U⁻ᵀ K) with K + S = Uᵀ U, one block of threads an environment.
+
+    It leaves ``s`` zero for the next S.
+    """
     env, lane = wp.tid()
     if active[env] == 0 or not fits(small, env):
         return
-    m, pads = small.count[env], small.pads[env]
-    known = small.known[env] == pads
-    for e in range(lane, m * m, lanes):
-        i = e / m
-        j = e - m * i
-        if i < pads and j < pads:
-            if not known:
-                small.k[env, i, j] = rest_block(rest, small.node[env, i], small.node[env, j])
-        elif i == j:
-            small.k[env, i, j] = wp.identity(n=3, dtype=wp.float64)
-        else:
-            small.k[env, i, j] = wp.mat33d()
+    size, pads = padded_size(small.count[env]), 3 * small.pads[env]
     good = wp.bool(True)
-    if not known:
-        good = invert_small(small.k, small, env, pads, lane, lanes)
-    wait_for_block()
-    if lane == 0:
-        small.known[env] = pads
-    if good:
-        for e in range(lane, m * m, lanes):
-            i = e / m
-            j = e - m * i
-            if i <= j:
-                T = small.a[env, i, j] + small.k[env, i, j]
-                small.a[env, i, j] = T
-                small.a[env, j, i] = wp.transpose(T)
-        good = invert_small(small.a, small, env, m, lane, lanes)
+    if small.known[env] != small.pads[env]:
+        good = find_stiffness(rest, small, env, lane, lanes)
     wait_for_block()
     if good:
-        for e in range(lane, m * m, lanes):
-            i = e / m
-            j = e - m * i
-            if i < j:
-                T = wp.float64(0.5) * (small.a[env, i, j] + wp.transpose(small.a[env, j, i]))
-                small.a[env, i, j] = T
-                small.a[env, j, i] = wp.transpose(T)
-        wait_for_block()
-        for e in range(lane, m * m, lanes):
-            i = e / m
-            j = e - m * i
-            total = wp.mat33d()
-            for n in range(m):
-                total += small.k[env, i, n] * small.a[env, n, j]
-            small.product[env, i, j] = total
-        wait_for_block()
-        for e in range(lane, m * m, lanes):
-            i = e / m
-            j = e - m * i
+        if lane == 0:
+            small.known[env] = small.pads[env]
+        for e in range(lane, size * size, lanes):
+            i = e / size
+            j = e - size * i
+            if i >= pads or j >= pads:
+                value = wp.float64(0.0)
+                if i == j:
+                    value = wp.float64(1.0)
+                small.k[env, i, j] = value
             if i <= j:
-                W = small.k[env, i, j]
-                for n in range(m):
-                    W -= small.product[env, i, n] * small.k[env, n, j]
-                for p in range(3):
-                    for q in range(3):
-                        small.w[env, 3 * i + p, 3 * j + q] = W[p, q]
-                        small.w[env, 3 * j + q, 3 * i + p] = W[p, q]
-    elif lane == 0:
+                small.w[env, i, j] = small.k[env, i, j] + small.s[env, i, j]
+        good = factor(small.w, env, size, lane, lanes)
+    if good:
+        solve(small.w, small.k, small.s, env, size, lane, lanes)
+        gram(small.k, small.s, False, small.w, env, size, lane, lanes)
+    else:
         # Something is not finite: without contacts it is still a preconditioner.
-        small.count[env] = 0
-        small.known[env] = -1
-    wait_for_block()
-    for e in range(lane, m * m, lanes):
-        small.a[env, e / m, e % m] = wp.mat33d()
+        wait_for_block()
+        if lane == 0:
+            small.count[env] = 0
+            small.known[env] = -1
+    for e in range(lane, size * size, lanes):
+        small.s[env, e / size, e % size] = wp.float64(0.0)
 
 
 @wp.func
@@ -525,6 +473,11 @@ def affine_motion(rest: Rest, small: Small, env: wp.int32, a: wp.int32, r: VecAr
     return x
 
 
+def even(room: int) -> int:
+    """Contact nodes whose unknowns fill whole panels."""
+    return room + room % 2
+
+
 class LowRank:
     """Contact nodes, their factored small systems W, and products with these.
 
@@ -537,7 +490,7 @@ class LowRank:
         self.rest, self.batch, self.row_lanes, self.device = rest, batch, row_lanes, device
         self.lanes = LANES if device.is_cuda else 1
         nodes = max(1, len(rest.surface_node))
-        room = max(1, min(room, nodes))
+        room = even(max(1, min(room, nodes)))
 
         def zeros(*shape: int, dtype: type = wp.float32) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device)
@@ -547,9 +500,7 @@ class LowRank:
         small.count, small.pads = zeros(batch, dtype=wp.int32), zeros(batch, dtype=wp.int32)
         small.node = zeros(batch, room, dtype=wp.int32)
         small.known = wp.full(batch, -1, dtype=wp.int32, device=device)
-        small.a, small.k, small.product = (zeros(batch, room, room, dtype=wp.mat33d) for _ in range(3))
-        small.row, small.column = zeros(batch, room, dtype=wp.mat33d), zeros(batch, room, dtype=wp.mat33d)
-        small.w = zeros(batch, 3 * room, 3 * room, dtype=wp.float64)
+        small.s, small.k, small.w = (zeros(batch, 3 * room, 3 * room, dtype=wp.float64) for _ in range(3))
         small.t, small.force = zeros(batch, 3 * room, dtype=wp.float64), zeros(batch, 3 * room, dtype=wp.float64)
         self.bodies = len(rest.affine_node) // 4
         small.root = zeros(batch, 4 * self.bodies, 4, dtype=wp.mat33d)
@@ -572,10 +523,13 @@ class LowRank:
         """Take in affine bodies and rows, after ``find_contacts``."""
         rest, small = self.rest, self.small
         if self.bodies:
-            self._launch(factor_affine, (self.batch, self.bodies), [rest, system, active, small])
+            apart = _APART if self.device.is_cuda else 1
+            self._launch(factor_affine, (self.batch, self.bodies, apart), [rest, system, active, small])
         if rows:
-            inputs = [system, contacts, rest, active, self.row_lanes, small]
-            self._launch(add_rows, (self.batch, self.row_lanes), inputs)
+            self._launch(add_rows, (self.batch, self.row_lanes), [contacts, rest, active, self.row_lanes, small])
+            if self.bodies:
+                inputs = [contacts, rest, active, self.lanes, small]
+                self._launch(add_bodies, (self.batch, self.bodies, self.lanes), inputs, self.lanes)
             self._launch(factor_small, (self.batch, self.lanes), [rest, active, self.lanes, small], self.lanes)
 
     def find_forces(self, y: wp.array, z: wp.array, running: wp.array, place: wp.array) -> None:

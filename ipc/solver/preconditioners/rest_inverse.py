@@ -47,11 +47,14 @@ TILED_FROM = 8
 """Number of environments from which tiles are used instead of products with vectors."""
 THREADS = 200_000
 """Threads of a product with vectors; a GPU needs many to read memory at its full rate."""
-MAX_CONTACTS = 128
+MAX_CONTACTS = 200
 """Most contact nodes that an environment may have; factoring costs their number cubed."""
-_BLOCK_BYTES = 72
-CONTACT_BYTES = 2**30
-"""Memory that the contacts of all environments may take."""
+_PAIR_BYTES = 3 * 72
+"""Memory for two contact nodes: a 3 × 3 block of three matrices."""
+CONTACT_BYTES = 2**32
+"""Most memory that the contacts of all environments may take."""
+CONTACT_SHARE = 1 / 16
+"""The same as a share of the device's memory."""
 
 
 @wp.kernel
@@ -282,9 +285,10 @@ def scatter_inside(
     z[env, i] = value
 
 
-def room(batch: int) -> int:
+def room(batch: int, device: wp.Device) -> int:
     """Contact nodes for which each of so many environments has memory."""
-    return int(min(MAX_CONTACTS, (CONTACT_BYTES / (4 * _BLOCK_BYTES * batch)) ** 0.5))
+    memory = min(CONTACT_BYTES, CONTACT_SHARE * device.total_memory) if device.is_cuda else CONTACT_BYTES
+    return int(min(MAX_CONTACTS, (memory / (_PAIR_BYTES * batch)) ** 0.5))
 
 
 def padded(n: int) -> int:
@@ -341,7 +345,7 @@ class RestInverse:
         numbers = {"unknown": unknown, "part": part, "surface": surface, "surface_node": touching}
         numbers |= {"affine": affine, "affine_node": affine_node}
         self.rest = rest = filled(Rest, device, parts | numbers)
-        self.low_rank = LowRank(rest, batch, room(batch) if max_contacts is None else max_contacts, lanes, device)
+        self.low_rank = LowRank(rest, batch, room(batch, device) if max_contacts is None else max_contacts, lanes, device)
         self.x, self.y = self._vectors(int(firsts[-1]), int(firsts[-1]))
         views = [rest.inverse[int(s) : int(s) + w * w].reshape((1, w, w)) for s, w in zip(starts, widths, strict=False)]
         self.products = [

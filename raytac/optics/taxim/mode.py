@@ -1,7 +1,7 @@
 """The Taxim table as an optical mode: a polynomial by slope bin, shadows, the image at rest.
 
-Si and Yuan, Taxim, RA-L 2022, sections III-B and III-C; semantics of their released simulator (docs/concepts/taxim-table.md lists what
-is kept as it is, oddities included, and what differs). Deformation is not in here: the physics gives the surface.
+Si and Yuan, Taxim, RA-L 2022, sections III-B and III-C; semantics of their released simulator, oddities included
+(docs/concepts/taxim-table.md lists what differs). Deformation is not in here: the physics gives the surface.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ class _Array:
 
 
 class _Plain:
-    """Replaces stand-ins by their arrays, up to ``_MOST_ITEMS`` items."""
+    """Replace stand-ins by their arrays, up to ``_MOST_ITEMS`` items."""
 
     def __init__(self) -> None:
         self._budget = _MOST_ITEMS

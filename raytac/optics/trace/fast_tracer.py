@@ -30,7 +30,6 @@ from raytac.optics.trace.direct import direct_light
 from raytac.optics.trace.interreflection import BounceField, CaseLight
 from raytac.optics.trace.led import Lamp
 from raytac.optics.trace.quadrature import quadrature
-from raytac.optics.trace.scene import SensorScene
 from raytac.optics.trace.shadow import ShadowGrid
 from raytac.optics.trace.tracer import Tracer, total
 from raytac.specs.sensor import AUTO, LedSpec, SensorSpec
@@ -69,8 +68,7 @@ class FastTracer(Tracer):
         mi, bounce = self.mi, None
         lamps = [Lamp.from_spec(mi, led) for led in self.sensor.lights.leds]
         if self._lit and self.config.bounce:
-            scene = SensorScene(mi, self.sensor, grid)
-            case = CaseLight.fit(scene, self._scene_lamps, self.groups, self.seed)
+            case = CaseLight.of(mi, self.sensor, grid, self._scene_lamps, self.groups, self.seed)
             bounce = BounceField.build(mi, self.layout, case, self.camera, self.sensor.gelpad.thickness, self._lit_channels)
         shadow = self._shadow_grid(self.layout) if self._lit and self.shadows else None
         self._arrays = FastArrays(lamps, bounce, shadow, [])

@@ -22,11 +22,13 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from raytac.gel.surface import PadGrid
 from raytac.optics.camera import Pinhole
 from raytac.optics.geometry import CoatField, CoatLayout, NodeGrid, PixelSample, bilinear, nodes_in_view
 from raytac.optics.trace.led import Lamp
 from raytac.optics.trace.reference import OFFSET, connect, trace
 from raytac.optics.trace.scene import UNIT, SensorScene
+from raytac.specs.sensor import SensorSpec
 
 SAMPLES = 1 << 18
 """Paths that the fit of the case's light uses."""
@@ -38,6 +40,10 @@ REACH = 7
 """Radius of the neighbourhood that lights a patch [patches]."""
 TILT = 1.2
 """Largest tangent of a normal's tilt in the fit."""
+_MOST_FITS = 64
+"""Fits that a process keeps."""
+_fits: dict[tuple[Any, ...], CaseLight] = {}
+"""Last fits of this process, by all that they depend on."""
 
 
 def _monomials(u: Any, v: Any) -> list[Any]:
@@ -52,7 +58,24 @@ class CaseLight:
     half: tuple[float, float]
 
     @classmethod
-    def fit(cls, scene: SensorScene, lamps: list[Lamp], groups: list[int], seed: int = 0, samples: int = SAMPLES) -> CaseLight:
+    def of(cls, mi: Any, sensor: SensorSpec, grid: PadGrid, lamps: list[Lamp], groups: list[int], seed: int) -> CaseLight:
+        """The fit of a sensor at rest, with ``SAMPLES`` paths; made once for sensors of one kind.
+
+        It does not depend on camera and response. So both sensors of a gripper share a fit, and no second Mitsuba scene is built, which
+        would leave memory behind.
+        """
+        parts = sensor.gelpad, sensor.coat, sensor.case, sensor.refraction, sensor.lights.leds, sensor.markers.rows > 0
+        nodes = tuple(values.tobytes() for values in (grid.x, grid.y, grid.rest))
+        key = parts, nodes, tuple(groups), seed, SAMPLES, mi.variant()
+        if key not in _fits:
+            light = cls.fit(SensorScene(mi, sensor, grid), lamps, groups, seed, SAMPLES)
+            while len(_fits) >= _MOST_FITS:
+                del _fits[next(iter(_fits))]
+            _fits[key] = light
+        return _fits[key]
+
+    @classmethod
+    def fit(cls, scene: SensorScene, lamps: list[Lamp], groups: list[int], seed: int, samples: int) -> CaseLight:
         """Path-trace from random points of the coat at rest, and fit by least squares.
 
         Directions are cosine-distributed about random normals, so a path's π L estimates E; directions into the pad's plane count as

@@ -111,34 +111,34 @@ class SoftReader:
             return self._batch(state).measure(state).numpy().copy()
 
     def launch(self, state: CoatState, failed: wp.array) -> PadArrays:
-        """Read every pad on the device; nothing is copied. ``failed``: (B,), bool.
+        """Read every pad on the device but where ``failed`` (B,); nothing is copied.
 
-        From the second reading of the same arrays on, all kernels are launched as one recording.
+        The next reading overwrites the arrays. From the second reading of one state on, all kernels are launched as one recording.
         """
         with LAUNCH:
             batch = self._batch(state)
-            wp.copy(batch.given, failed)
+            wp.copy(batch.unread, failed)
             return batch.read(state)
 
     def read(self, state: CoatState, failed: np.ndarray) -> SoftReading:
         """Surface, contact and forces of every pad, copied; NaN where ``failed`` (B,) or not finite."""
         device: Any = state.vertices.device
         shown = self.launch(state, wp.array(failed, dtype=wp.bool, device=device))
-        lost, clearance, residual, centre = map(_copied, (shown.failed, shown.clearance, shown.residual, shown.centre))
+        failed, clearance, residual, centre = map(_copied, (shown.failed, shown.clearance, shown.residual, shown.centre))
         coat, vertices, forces = map(_copied, (shown.coat, shown.vertices, shown.forces))
         height, contact, underside = map(_copied, (shown.height, shown.contact, shown.underside))
         poses, touching = _copied(state.objects.poses), _copied(state.objects.touching)
         poses[:, :, 2, 3] -= np.nan_to_num(clearance)[:, None]
         for values in (vertices, forces, poses):
-            values[lost] = np.nan
+            values[failed] = np.nan
         self._warn(residual)
         pose = None
         if poses.shape[1]:
-            first = np.where(touching.any(axis=1), touching.argmax(axis=1), 0)
+            first = np.where(touching.any(axis=1), touching.argmax(axis=1), 0)  # object that touches, else the first
             pose = poses[np.arange(len(poses)), first]
         surface = GelSurface(self.grid, height, contact.view(bool), centre, pose, DeformedCoat(self.mesh.coat, coat))
-        each = tuple(poses[:, k].copy() for k in range(poses.shape[1]))
-        return SoftReading(surface, vertices, forces, clearance, each, underside, residual, lost)
+        by_object = tuple(poses[:, k].copy() for k in range(poses.shape[1]))
+        return SoftReading(surface, vertices, forces, clearance, by_object, underside, residual, failed)
 
     def _batch(self, state: CoatState) -> _Batch:
         """Arrays for as many environments as the state has, on its device."""
@@ -175,7 +175,10 @@ class SoftReader:
 
     @cached_property
     def compliances(self) -> tuple[np.ndarray, np.ndarray]:
-        """Compliance of the mesh, and if its sides may not move outwards; they take a while."""
+        """Compliance of the mesh's coat, and of one whose sides may not move outwards.
+
+        They take a while (``coat_compliance``).
+        """
         continued = coat_compliance(self.mesh, self._gelpad, rollers=True, along=(0, 1, 2))
         return coat_compliance(self.mesh, self._gelpad)[0], continued
 
@@ -188,7 +191,7 @@ class _Batch:
     """Arrays and kernels of a reader for B pads of one device.
 
     Attributes:
-        given: environments that are not to be read, (B,), bool.
+        unread: environments that are not to be read, (B,), bool.
     """
 
     def __init__(self, reader: SoftReader, num_envs: int, device: str) -> None:
@@ -199,35 +202,31 @@ class _Batch:
         samples = make_grid(gelpad, max(_SAMPLE, *grid.pitch))
         self._clearance = BarrierClearance(self._surface, samples, mesh.d_hat, products)
         self._rows, self._columns = self._surface.matrices(grid.x, grid.y)
-        self._lattice, self._spare = (
-            products.zeros(*self._surface.lattice),
-            products.zeros(grid.shape[0], self._surface.lattice[1]),
-        )
-        self._rise, self._undersides = (
-            products.zeros(*grid.shape),
-            Undersides(grid, float(grid.rest.max()), num_envs, self._device),
-        )
+        self._lattice = products.zeros(*self._surface.lattice)
+        self._half_product = products.zeros(grid.shape[0], self._surface.lattice[1])
+        self._rise = products.zeros(*grid.shape)
+        self._undersides = Undersides(grid, float(grid.rest.max()), num_envs, self._device)
         self._rest = self._on_device(grid.rest, wp.float64)
         self._hats, self._lines = hat_arrays(mesh.coat, grid.x, grid.y, self._device), node_lines(grid.x, grid.y)
         vertices = len(mesh.coat.rest)
         self._sound, self._load = self._zeros(num_envs, dtype=wp.int32), self._zeros(num_envs, vertices, dtype=wp.float64)
-        self._solved, self._none = self._zeros(0, dtype=wp.float64), self._zeros(num_envs, dtype=wp.bool)
+        self._solved, self._none_failed = self._zeros(0, dtype=wp.float64), self._zeros(num_envs, dtype=wp.bool)
         self._height, self._contact = (self._zeros(num_envs, *grid.shape, dtype=dtype) for dtype in (wp.float32, wp.uint8))
-        self._above = self._zeros(num_envs, *grid.shape, dtype=wp.float32)
+        self._above_rest = self._zeros(num_envs, *grid.shape, dtype=wp.float32)
         self._coat, self._centre = self._zeros(num_envs, vertices, dtype=wp.vec3d), self._zeros(num_envs, dtype=wp.vec2d)
-        self.given = self._zeros(num_envs, dtype=wp.bool)
+        self.unread = self._zeros(num_envs, dtype=wp.bool)
         self._state: CoatState | None = None
         self._recorded: Recorded | None = None
         self._shown: Any = None
         self._residual, self._failed = self._zeros(num_envs, dtype=wp.float64), self._zeros(num_envs, dtype=wp.bool)
 
     def measure(self, state: CoatState) -> wp.array:
-        """Launch the clearance [m], (B,)."""
-        self._find_sound(state, self._none)
+        """Launch the clearance of all environments [m], (B,)."""
+        self._find_sound(state, self._none_failed)
         return self._measure(state)
 
     def read(self, state: CoatState) -> PadArrays:
-        """Show a state but for the environments ``given`` as failed."""
+        """Show a state, but for the environments ``unread``."""
         if self._state is not state:
             self._state, self._recorded = state, None
             self._shown = self._launch_all(state)
@@ -241,10 +240,10 @@ class _Batch:
         """Launch all that is shown."""
         correction, sound = self._reader.correction, self._sound
         lines, under = self._height.shape[:2], self._undersides
-        self._find_sound(state, self.given)
+        self._find_sound(state, self.unread)
         clearance = self._measure(state)
         self._surface.rise(self._lattice)
-        self._products.sandwich(self._rows, self._lattice, self._columns, self._spare, self._rise)
+        self._products.sandwich(self._rows, self._lattice, self._columns, self._half_product, self._rise)
         under.find(state.objects, sound, clearance)
         under.remove_behind(state.objects, self._rise.numbers, clearance)
         if correction is None:
@@ -267,6 +266,7 @@ class _Batch:
         )  # fmt: skip
 
     def _find_sound(self, state: CoatState, failed: wp.array) -> None:
+        """Mark environments that have not ``failed`` (B,) and whose numbers are all finite."""
         objects = state.objects
         arrays = [failed, state.vertices, state.forces, objects.poses, self._sound]
         self._launch(kernels.find_sound, len(self._sound), arrays)
@@ -274,6 +274,7 @@ class _Batch:
             self._launch(kernels.find_sound_surfaces, vertices.shape, [vertices, self._sound])
 
     def _measure(self, state: CoatState) -> wp.array:
+        """Launch the clearance of sound environments [m], (B,)."""
         self._surface.place(state.vertices, self._sound)
         self._clearance.measure(state.forces, state.objects, self._sound)
         return self._clearance.clearance
@@ -291,13 +292,20 @@ class _Batch:
             under = finer.under
         normal.solve(state.forces, clearance, sound, under)
         self._solved = normal.search.best
-        self._products.sandwich(self._rows, normal.rise, self._columns, self._spare, self._other)
+        self._products.sandwich(self._rows, normal.rise, self._columns, self._half_product, self._normal_rise)
         laid = [int(correction.normal), correction.closed_gap, clearance, *sampler.nearest, normal.pressure.numbers, self._rest]
-        fields = [rise, self._other.numbers, sampler.dent(normal).numbers, self._undersides.under, self._height, self._contact]
+        fields = [
+            rise,
+            self._normal_rise.numbers,
+            sampler.dent(normal).numbers,
+            self._undersides.under,
+            self._height,
+            self._contact,
+        ]
         self._launch(normal_kernels.lay, lines, [*laid, *fields])
         tangential.correct(state.objects)
-        self._launch(kernels.above_rest, lines, [self._height, self._rest, self._above])
-        placed = [clearance, tangential.displacement, self._lines, self._above, state.vertices, self._coat]
+        self._launch(kernels.above_rest, lines, [self._height, self._rest, self._above_rest])
+        placed = [clearance, tangential.displacement, self._lines, self._above_rest, state.vertices, self._coat]
         self._launch(kernels.place_coat, self._coat.shape, [self._surface.struct, *placed])
 
     @cached_property
@@ -316,7 +324,8 @@ class _Batch:
         return normal, ContactSampler(normal, reader.grid.x, reader.grid.y), tangential, fine
 
     @cached_property
-    def _other(self) -> Any:
+    def _normal_rise(self) -> Any:
+        """Rise of the corrected contact on the grid [m]; made at the first correction."""
         return self._products.zeros(*self._reader.grid.shape)
 
     def _on_device(self, values: np.ndarray, dtype: Any) -> wp.array:

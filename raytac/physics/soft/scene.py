@@ -82,8 +82,8 @@ class SoftScene:
         """
         if gravity is not None and settings is not None:
             raise InputError("gravity", value=gravity, rule="must be left out where settings are given, which have their own")
-        vector = (settings.gravity if settings is not None else _GRAVITY) if gravity is None else gravity
-        self.gravity = np.asarray(vector, float)
+        default_gravity = _GRAVITY if settings is None else settings.gravity
+        self.gravity = np.asarray(default_gravity if gravity is None else gravity, float)
         self.num_envs = num_envs or batch_of(world_from_pad, 4, world_from_body)
         self._registry = SceneRegistry(pads, bodies, self.num_envs)
         self.pads, self.bodies = self._registry.pads, self._registry.bodies
@@ -101,9 +101,11 @@ class SoftScene:
             forcing=accuracy.forcing,
             halvings=0,  # scenes have substeps of their own
         )
-        solids = [self._at_start(body.solid, self._start[1][body.name][0]) for body in bodies]
-        gels = [pad_body(pad.mesh, pad.sensor.gelpad, pad.name) for pad in pads]
-        gels = [self._at_start(gel, pose) for gel, pose in zip(gels, self._start[0][0], strict=True)]
+        solids = [_placed_at(body.solid, self._start[1][body.name][0]) for body in bodies]
+        gels = [
+            _placed_at(pad_body(pad.mesh, pad.sensor.gelpad, pad.name), pose)
+            for pad, pose in zip(pads, self._start[0][0], strict=True)
+        ]
         self._friction = mu = self._registry.friction() | dict(friction or {})
         try:
             self.world = ipc.World([*gels, *solids], self.settings, self.num_envs, device, mu, ignored)
@@ -137,7 +139,7 @@ class SoftScene:
     def is_small(self, world_from_pad: ArrayLike, driven: _Poses | None = None, dt: ArrayLike | None = None) -> np.ndarray:
         """Environments (B,) in which ``step`` with the same arguments is not divided, or has failed."""
         done, goal = np.zeros(self.num_envs, int), self._goal(world_from_pad, driven)
-        part, _ = self._substeps.next_part(done, self._now, goal, self._lengths(dt))
+        part, _ = self._substeps.next_part(done, self._now, goal, self._durations(dt))
         return self._failed | (part == self._substeps.limits.most)
 
     def step(
@@ -162,12 +164,12 @@ class SoftScene:
                 only the one with that motion fails, with a ``RuntimeWarning``.
         """
         start, goal, most = self._now.copy(), self._goal(world_from_pad, driven), self._substeps.limits.most
-        chosen, length = np.isin(np.arange(self.num_envs), chosen_envs(envs, self.num_envs)), self._lengths(dt)
+        chosen, durations = np.isin(np.arange(self.num_envs), chosen_envs(envs, self.num_envs)), self._durations(dt)
         before: SceneState | None = None
-        total, self._asleep = self._carry(goal, length, chosen)
+        total, self._asleep = self._carry(goal, durations, chosen)
         done = np.where(chosen & ~self._asleep, 0, most)
         while True:
-            part, refused = self._substeps.next_part(done, self._now, goal, length)
+            part, refused = self._substeps.next_part(done, self._now, goal, durations)
             if refused and self.num_envs == 1:
                 if before is not None:
                     self.restore(before)
@@ -186,7 +188,7 @@ class SoftScene:
                 before = self.save()
             done = done + part
             poses = start.towards(goal, done / most)
-            total = total.then(self.advance(poses.pads, poses.bodies, length * part / most, part > 0))
+            total = total.then(self.advance(poses.pads, poses.bodies, durations * part / most, part > 0))
 
     def advance(
         self,
@@ -198,19 +200,22 @@ class SoftScene:
         """One undivided solver step to (B, S, 4, 4) and (B, 4, 4) by name; others as for ``step``."""
         chosen = np.ones(self.num_envs, bool) if envs is None else envs
         self._aim(world_from_pad, driven, chosen)
-        return self._report(self.world.step(self._lengths(dt), chosen), chosen & ~self._failed)
+        return self._report(self.world.step(self._durations(dt), chosen), chosen & ~self._failed)
 
     @property
     def asleep(self) -> np.ndarray:
         """Environments (B,) that slept through the last step: nothing touches their gels."""
         return self._asleep.copy()
 
-    def _carry(self, goal: Poses, length: np.ndarray, chosen: np.ndarray) -> tuple[SceneReport, np.ndarray]:
-        """Let those of the environments (B,) that sleep go to ``goal``; a report without a solve."""
+    def _carry(self, goal: Poses, durations: np.ndarray, chosen: np.ndarray) -> tuple[SceneReport, np.ndarray]:
+        """Move those of the chosen environments (B,) that sleep to ``goal``, without a solve.
+
+        Returns a report of no steps, and which slept (B,).
+        """
         asleep = chosen & ~self._failed & self._sleep.choose(self._now, goal)
         if asleep.any():
             self._aim(goal.pads, goal.bodies, asleep)
-            self.world.carry(length, asleep)
+            self.world.carry(durations, asleep)
         return SceneReport.of_none(self._failed, *self._energies), asleep
 
     def _aim(self, world_from_pad: np.ndarray, driven: Mapping[str, np.ndarray], chosen: np.ndarray) -> None:
@@ -222,26 +227,26 @@ class SoftScene:
             self.world.set_target(name, pose[:, :3, 3], quaternions(pose))
             self._now.bodies[name][chosen] = pose[chosen]
 
-    def _report(self, r: ipc.StepReport, stepped: np.ndarray) -> SceneReport:
+    def _report(self, report: ipc.StepReport, stepped: np.ndarray) -> SceneReport:
         """The solver's report, of the environments (B,) that it stepped."""
-        self._failed, self._energies = r.failed, (r.elastic, r.barrier)
+        self._failed, self._energies = report.failed, (report.elastic, report.barrier)
         return SceneReport(
-            failed=r.failed,
-            converged=r.converged,
-            unconverged=(stepped & ~r.converged & ~r.failed).astype(int),
-            last_converged=r.converged,
-            min_gap=r.min_gap,
-            min_det=np.where(stepped, r.min_det, 1.0),
-            blocked=r.blocked,
-            newton=r.newton,
-            linear=r.linear,
-            elastic=r.elastic,
-            barrier=r.barrier,
+            failed=report.failed,
+            converged=report.converged,
+            unconverged=(stepped & ~report.converged & ~report.failed).astype(int),
+            last_converged=report.converged,
+            min_gap=report.min_gap,
+            min_det=np.where(stepped, report.min_det, 1.0),
+            blocked=report.blocked,
+            newton=report.newton,
+            linear=report.linear,
+            elastic=report.elastic,
+            barrier=report.barrier,
             substeps=stepped.astype(int),
         )
 
-    def _lengths(self, dt: ArrayLike | None) -> np.ndarray:
-        """Length of the step of every environment [s], (B,)."""
+    def _durations(self, dt: ArrayLike | None) -> np.ndarray:
+        """Duration of the step of every environment [s], (B,)."""
         return np.broadcast_to(np.asarray(self.settings.dt if dt is None else dt, float), self.num_envs)
 
     def wrench(self, pad: str) -> np.ndarray:
@@ -318,16 +323,17 @@ class SoftScene:
 
     def reading(self, pad: str, grid: PadGrid | None = None, failed: np.ndarray | None = None) -> SoftReading:
         """Surface, contact, forces of a pad on its own grid or another; NaN where ``failed`` (B,)."""
-        reader, lost = self._reader(pad, grid), self._failed if failed is None else self._failed | failed
-        return reader.read(self.coat_state(pad), lost)
+        unread = self._failed if failed is None else self._failed | failed
+        return self._reader(pad, grid).read(self.coat_state(pad), unread)
 
     def arrays(self, pad: str, grid: PadGrid | None = None, failed: np.ndarray | None = None) -> PadArrays:
         """As ``reading``, but arrays of the device that the next reading overwrites: no copies."""
-        lost = self._failed if failed is None else self._failed | failed
-        given = wp.array(lost, dtype=wp.bool, device=self.world.device)
-        return self._reader(pad, grid).launch(self.coat_state(pad), given)
+        unread = self._failed if failed is None else self._failed | failed
+        on_device = wp.array(unread, dtype=wp.bool, device=self.world.device)
+        return self._reader(pad, grid).launch(self.coat_state(pad), on_device)
 
     def _reader(self, pad: str, grid: PadGrid | None) -> SoftReader:
+        """The reader of a pad; on another grid than the last one it is made again."""
         scene_pad = self._registry.pad(pad)
         if pad not in self._readers or (grid is not None and grid is not self._readers[pad].grid):
             mesh = replace(scene_pad.mesh, d_hat=self.world.d_hat)
@@ -397,8 +403,10 @@ class SoftScene:
             return np.concatenate([wrench.force, wrench.torque], axis=1)
         sums, index = self.world.sums.host, self.world.layout.names.index(name)
         force, torque = sums["force"][:, index], sums["torque"][:, index]
-        away = sums["position"][:, index] - self.pose(name)[:, :3, 3]  # of a free soft body the sums are about the world's origin
-        return np.concatenate([force, torque + np.cross(away, force)], axis=1)
+        lever = (
+            sums["position"][:, index] - self.pose(name)[:, :3, 3]
+        )  # of a free soft body the sums are about the world's origin
+        return np.concatenate([force, torque + np.cross(lever, force)], axis=1)
 
     def _surface_numbers(self, pad: ScenePad) -> np.ndarray:
         """Number of each coat vertex among the solver's surface vertices."""
@@ -413,6 +421,7 @@ class SoftScene:
         return (points - position[:, None]) @ rotation
 
     def _goal(self, world_from_pad: ArrayLike, driven: _Poses | None) -> Poses:
+        """Poses at the end of a step; bodies that are not named stay."""
         pads = rigid_poses("world_from_pad", world_from_pad, self.num_envs, len(self.pads))
         return Poses(pads, self._now.bodies | self._registry.named(driven or {}))
 
@@ -436,6 +445,7 @@ class SoftScene:
             state.y[mask, nodes] = nodes_now[mask]
         return state
 
-    @staticmethod
-    def _at_start(solid, pose: np.ndarray):
-        return replace(solid, pose=ipc.Pose(tuple(pose[:3, 3].tolist()), tuple(quaternion(pose[:3, :3]).tolist())))
+
+def _placed_at(solid: Any, pose: np.ndarray) -> Any:
+    """A body of the solver at ``world_from_body`` (4, 4)."""
+    return replace(solid, pose=ipc.Pose(tuple(pose[:3, 3].tolist()), tuple(quaternion(pose[:3, :3]).tolist())))

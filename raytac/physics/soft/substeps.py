@@ -68,6 +68,8 @@ class Substeps:
         beam may snap back): the solver resolves them, in the smallest parts.
         """
         most, waits = self.limits.most, (done < self.limits.most) & ~self._query.failed
+        if not waits.any():
+            return np.zeros_like(done), {}
         motions = self.motions(now, goal, dt * (1.0 - done / most))
         driven = {
             name: motion if self._is_driven(name) else replace(motion, end=motion.start) for name, motion in motions.items()
@@ -266,7 +268,7 @@ def _plane_gaps(a: BoxMotion, plane: BoxMotion) -> tuple[np.ndarray, ...]:
     """As ``_box_gaps``, of a box and a half-space: its one normal, and the box's lowest corner."""
     before, after = (inverse(p) @ t for p, t in ((plane.start, a.start), (plane.end, a.end)))
     start, end = (_transform(pose, a.corners()) for pose in (before, after))
-    length, turn = np.linalg.norm(end - start, axis=2), _relative_turn(before, after)
+    length, turn = _lengths(end - start), _relative_turn(before, after)
     lowest = start[:, :, 2].argmin(axis=1)
     gaps = np.stack([start[:, :, 2].min(axis=1), end[:, :, 2].min(axis=1) - _chord_error(start, end, turn)])
     return gaps[:, :, None], length[np.arange(len(start)), lowest], length.max(axis=1), turn
@@ -281,13 +283,13 @@ def _box_gaps(a: BoxMotion, b: BoxMotion) -> tuple[np.ndarray, ...]:
     before, after = (inverse(p) @ t for p, t in ((b.start, a.start), (b.end, a.end)))
     start, end = (_transform(pose, a.corners()) for pose in (before, after))
     b_start, b_end = (_transform(inverse(pose), b.corners()) for pose in (before, after))  # of b, in the frame of a
-    longest, turn = np.linalg.norm(end - start, axis=2).max(axis=1), _relative_turn(before, after)
+    longest, turn = _lengths(end - start).max(axis=1), _relative_turn(before, after)
     error = np.maximum(_chord_error(start, end, turn), _chord_error(b_start, b_end, turn))[:, None]
     of_a = np.stack([_separation(start, b), _separation(end, b) - error])
     of_b = np.stack([_separation(b_start, a), _separation(b_end, a) - error])
     # They may meet at the centre of the overlap of both boxes, in the first one's frame.
     centre = 0.5 * (np.clip(b_start.min(axis=1), a.low, a.high) + np.clip(b_start.max(axis=1), a.low, a.high))[:, None]
-    slide = np.linalg.norm((_transform(after, centre) - _transform(before, centre))[:, 0], axis=1)
+    slide = _lengths(_transform(after, centre) - _transform(before, centre))[:, 0]
     return np.concatenate([of_a, of_b], axis=2), slide, longest, turn
 
 
@@ -298,7 +300,7 @@ def _separation(points: np.ndarray, box: BoxMotion) -> np.ndarray:
 
 def _chord_error(start: np.ndarray, end: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """Greatest distance of a rotating corner from the straight line between its ends [m], (B,)."""
-    radius = np.maximum(np.linalg.norm(start, axis=2).max(axis=1), np.linalg.norm(end, axis=2).max(axis=1))
+    radius = np.maximum(_lengths(start).max(axis=1), _lengths(end).max(axis=1))
     return radius * (1.0 - np.cos(0.5 * turn))
 
 
@@ -308,7 +310,16 @@ def _relative_turn(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 def _transform(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points (B, n, 3) through poses (B, 4, 4)."""
-    return np.einsum("bij,bnj->bni", poses[:, :3, :3], points) + poses[:, None, :3, 3]
+    # In memory by points: reductions over them, and over coordinates, then go through all environments at once.
+    moved = np.empty((points.shape[1], 3, len(poses)))
+    np.einsum("bij,bnj->nib", poses[:, :3, :3], points, out=moved)
+    moved += poses[:, :3, 3].T
+    return moved.transpose(2, 0, 1)
+
+
+def _lengths(vectors: np.ndarray) -> np.ndarray:
+    """Lengths (B, n) of vectors (B, n, 3)."""
+    return np.sqrt(vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2)
 
 
 def _move(poses: np.ndarray, centre: np.ndarray, displacement: np.ndarray, turn: np.ndarray) -> np.ndarray:

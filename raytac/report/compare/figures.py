@@ -160,7 +160,7 @@ def error_range(errors: Sequence[np.ndarray]) -> float:
 def write_sheet_of_scene(comparison: Comparison, scene: str, resolution: str, path: Path) -> None:
     """The reference, then every mode with its signed error below it; one colour scale."""
     rows = select(comparison.rows, scene=scene, resolution=resolution)
-    columns = min(max(4, len(rows) + 1), 6)
+    columns = min(max(3, len(rows) + 1), 6)
     reference = comparison.references[scene, resolution]
     compared = [row for row in rows if row.figures["frame_mae"] is not None]
     steady = [row for row in compared if row.figures["spp"] is None] or compared

@@ -34,7 +34,7 @@ class Mode:
     family: str
     """Name in keys and files; a sampled family has one mode for each number of samples a pixel."""
     build: Callable[[Setting], OpticalMode]
-    """Raises RaytacError where the mode cannot run."""
+    """Raise ``RaytacError`` where the mode cannot run."""
     code: Callable[[], tuple[str, ...]]
     """Modules whose source, with all that they import, shapes the image and its time."""
     words: str = ""

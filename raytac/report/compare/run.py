@@ -164,7 +164,7 @@ class _Run:
         """Press every scene for images of ``size``, and tell how long the comparison will take."""
         settings, first = self.settings, self.size == (0, 0)
         self.size = size
-        bar.set_postfix_str(f"{self._name}: presses")
+        bar.set_postfix_str(f"{self._size_text}: presses")
         spec, self._surfaces = press_peaks(settings.sensor, settings.scenes, size, settings.seed)
         self._tracers = Tracers(spec, self.device, settings.seed)
         self._references = References(self.folder, self._tracers, size, settings.reference_spp, Progress.write)
@@ -195,12 +195,12 @@ class _Run:
         return 1e-3 * once(fast.render, surface)
 
     @property
-    def _name(self) -> str:
+    def _size_text(self) -> str:
         return f"{self.size[0]}x{self.size[1]}"
 
     def measure(self, name: str, modes: Sequence[Mode], bar: Progress) -> None:
         """Rows of one scene, by every mode."""
-        _settings, size = self.settings, self._name
+        size = self._size_text
         bar.set_postfix_str(f"{size} {name}: reference")
         scene = _Scene(name, self._surfaces[name], self._references, self._tracers, self.size)
         self.images[name, size] = scene.truth
@@ -217,13 +217,13 @@ class _Run:
             bar.update()
 
     def _measure_mode(self, mode: Mode, scene: _Scene) -> None:
-        key, file = self._key(mode, scene), f"{scene.name}-{self._name}-{mode.name}"
+        key, file = self._key(mode, scene), f"{scene.name}-{self._size_text}-{mode.name}"
         row = self.store.read(file, key)
         if row is None:
             if mode.name not in self._built:
                 self._built[mode.name] = self._build(mode, scene)
             built, first_image_s = self._built[mode.name]
-            row = self._measure(mode, built, scene, self._name, self._tracers.spec.name, first_image_s)
+            row = self._measure(mode, built, scene, first_image_s)
             self.store.write(file, key, row)
             self.measured += 1
         self.rows.append(row)
@@ -260,11 +260,12 @@ class _Run:
             self._digests[code] = code_digest(*code, *CODE)
         return self._digests[code]
 
-    def _measure(self, mode: Mode, built: OpticalMode, scene: _Scene, size: str, sensor: str, first_image_s: float | None) -> Row:
+    def _measure(self, mode: Mode, built: OpticalMode, scene: _Scene, first_image_s: float | None) -> Row:
+        """Times, memory and errors of a mode on a scene."""
         image = _rgb(built, scene.surface)[0]
         figures: dict[str, Value] = {
             "scene": scene.name,
-            "resolution": size,
+            "resolution": self._size_text,
             "mode": mode.name,
             "family": mode.family,
             "label": mode.label,
@@ -272,7 +273,7 @@ class _Run:
             "short": mode.short or mode.family,
             "unbiased": mode.unbiased,
             "spp": mode.spp,
-            "sensor": sensor,
+            "sensor": self._tracers.spec.name,
             "device": built.device,
             "seed": self.settings.seed,
             "reference_spp": self.settings.reference_spp,
@@ -283,12 +284,12 @@ class _Run:
         errors = image_errors(image, scene.truth, scene.masks) if mode.has_reference else {}
         for region in REGIONS:
             for metric in METRICS:
-                figures[f"{region}_{metric}"] = _known(errors.get(f"{region}.{metric}"))
+                figures[f"{region}_{metric}"] = _finite(errors.get(f"{region}.{metric}"))
             for metric, value in scene.noise[region].items():
-                figures[f"noise_{region}_{metric}"] = _known(value)
+                figures[f"noise_{region}_{metric}"] = _finite(value)
         # Half of the mean square or more is then the reference's own noise, and the figure is a bound, not a value.
-        off, noise = figures["frame_rmse"], figures["noise_frame_rmse"]
-        figures["at_noise"] = None if off is None else bool(float(off) < math.sqrt(2) * float(noise or 0.0))
+        error, noise = figures["frame_rmse"], figures["noise_frame_rmse"]
+        figures["at_noise"] = None if error is None else bool(float(error) < math.sqrt(2) * float(noise or 0.0))
         figures["note"] = "; ".join(text for text in (mode.note, str(figures.pop("batch_note"))) if text)
         return Row(figures, image)
 
@@ -364,6 +365,6 @@ def _rgb(mode: OpticalMode, surface: GelSurface) -> np.ndarray:
     return rgb
 
 
-def _known(value: float | None) -> float | None:
+def _finite(value: float | None) -> float | None:
     """None for what is not a finite number (a region that is not there, PSNR of equal images)."""
     return None if value is None or not math.isfinite(value) else float(value)

@@ -10,7 +10,7 @@ import warp as wp
 
 import ipc
 from ipc.settings import RIGID_STIFFNESS, barrier_stiffness
-from ipc.solver import pcg
+from ipc.solver import affine_elimination, pcg
 from ipc.solver.block_jacobi import BlockJacobi
 from ipc.solver.preconditioners import RestInverse
 from tests.ipc.conftest import bonded_pad, small_pad
@@ -34,8 +34,12 @@ def blocks_on_pad(affine: tuple[bool, ...], num_envs: int = 1, **changes: object
 
 
 def with_blocks_only(world: ipc.World) -> ipc.World:
-    """The same world with 3×3 blocks for the nodes of affine bodies."""
-    world._newton.preconditioner = BlockJacobi(world.layout, world.num_envs, 1, world.device, eliminate=False)
+    """The same world with 3×3 blocks for the nodes of affine bodies, as if the elimination had no memory."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(affine_elimination, "MOST_BYTES", 0)
+        preconditioner = BlockJacobi(world.layout, world.num_envs, 1, world.device)
+    assert preconditioner.affine is None
+    world._newton.preconditioner = preconditioner
     return world
 
 

@@ -14,7 +14,7 @@ from ipc.bodies import Layout, build_layout, rotation_matrix
 from ipc.contact.contacts import Contacts, mat34d
 from ipc.solver.block_jacobi import BlockJacobi
 from ipc.solver.frames import VertexMap
-from ipc.solver.linear import SystemView
+from ipc.solver.linear import SystemView, turn_rows
 from ipc.solver.preconditioners import pays
 from ipc.solver.preconditioners.rest_inverse import RestInverse
 from ipc.solver.preconditioners.rest_stiffness import rest_blocks
@@ -73,6 +73,12 @@ class Problem:
         self.contacts.row_count = self._array(np.full(batch, len(rows)), wp.int32)
         self.contacts.concave = self._array(np.zeros((batch, len(rows))), wp.int32)
         s.project = self.mask(0)
+        shape = batch, len(rows)
+        for name, dtype in (("row_nodes", wp.vec4i), ("row_body", wp.int32)):
+            setattr(self.contacts, name, wp.zeros(shape, dtype=dtype, device=self.device))
+        for name in ("node_row", "body_row", "scaled_row"):
+            setattr(self.contacts, name, wp.zeros(shape, dtype=mat34d, device=self.device))
+        wp.launch(turn_rows, dim=(batch, LANES), inputs=[s, self.contacts, self.mask(), LANES], device=self.device)
 
     def _array(self, values: np.ndarray, dtype: type) -> wp.array:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)

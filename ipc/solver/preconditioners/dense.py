@@ -1,0 +1,205 @@
+"""Dense symmetric matrices, factored and multiplied by one block of threads each.
+
+A = Uᵀ U is computed by panels of ``PANEL`` rows (a left-looking Cholesky factorisation). A thread works on columns, two at a time, and
+keeps the panel's share of both in registers while it runs down the rows above. Threads side by side read numbers side by side, and all
+of them the same few of the panel. So a number is read once for a panel instead of once for a row, and matrices stay where they are, in
+global memory: 1.4 MB for 140 contact nodes are too many for a block's own.
+
+Matrices are (B, n, n) arrays of which an environment uses the first ``size`` rows, a multiple of ``PANEL``. On a CPU a block is a thread.
+"""
+
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false, reportInvalidTypeForm=false, reportOperatorIssue=false, reportReturnType=false
+
+from __future__ import annotations
+
+import warp as wp
+
+from ipc.arrays import FloatArray3d
+from ipc.solver.blocks import wait_for_block
+
+wp.set_module_options({"enable_backward": False})
+
+PANEL = 6
+"""Rows that are worked on together."""
+_WARP = 32
+
+mat62d = wp.types.matrix(shape=(PANEL, 2), dtype=wp.float64)
+mat66d = wp.types.matrix(shape=(PANEL, PANEL), dtype=wp.float64)
+
+
+@wp.func
+def panel_sums(
+    u: FloatArray3d, y: FloatArray3d, env: wp.int32, row: wp.int32, c: wp.int32, d: wp.int32, first: wp.int32, last: wp.int32
+) -> mat62d:
+    """Σ u[k, i] y[k, j] over ``first`` <= k < ``last``; rows i of a panel, columns j = c, d."""
+    sums = mat62d()
+    for k in range(first, last):
+        a, b = y[env, k, c], y[env, k, d]
+        for i in range(PANEL):
+            v = u[env, k, row + i]
+            sums[i, 0] = sums[i, 0] + v * a
+            sums[i, 1] = sums[i, 1] + v * b
+    return sums
+
+
+@wp.func
+def factored_panel(a: FloatArray3d, env: wp.int32, row: wp.int32) -> mat66d:
+    """U of a block on the diagonal, with the inverses of its own diagonal.
+
+    One of these is 0 where a pivot is not positive.
+    """
+    u = mat66d()
+    for i in range(PANEL):
+        for j in range(i, PANEL):
+            s = a[env, row + i, row + j]
+            for k in range(i):
+                s -= u[k, i] * u[k, j]
+            if i == j:
+                if s > wp.float64(0.0):
+                    u[i, i] = wp.float64(1.0) / wp.sqrt(s)
+            else:
+                u[i, j] = s * u[i, i]
+    return u
+
+
+@wp.func
+def substitute(u: mat66d, x: mat62d) -> mat62d:
+    """U⁻ᵀ x of a block on the diagonal."""
+    y = mat62d()
+    for i in range(PANEL):
+        a, b = x[i, 0], x[i, 1]
+        for k in range(i):
+            a -= u[k, i] * y[k, 0]
+            b -= u[k, i] * y[k, 1]
+        y[i, 0] = u[i, i] * a
+        y[i, 1] = u[i, i] * b
+    return y
+
+
+@wp.func
+def read_panel(a: FloatArray3d, env: wp.int32, row: wp.int32, c: wp.int32, d: wp.int32) -> mat62d:
+    x = mat62d()
+    for i in range(PANEL):
+        x[i, 0] = a[env, row + i, c]
+        x[i, 1] = a[env, row + i, d]
+    return x
+
+
+@wp.func
+def write_panel(x: mat62d, a: FloatArray3d, env: wp.int32, row: wp.int32, c: wp.int32, d: wp.int32):
+    for i in range(PANEL):
+        a[env, row + i, c] = x[i, 0]
+        a[env, row + i, d] = x[i, 1]
+
+
+@wp.func
+def factor(a: FloatArray3d, env: wp.int32, size: wp.int32, lane: wp.int32, lanes: wp.int32) -> wp.bool:
+    """U takes the place of a, whose lower half is not read outside blocks on the diagonal.
+
+    U has the inverses of its diagonal there. All threads get the same result: False where a pivot is not positive.
+    """
+    wait_for_block()
+    for p in range(size / PANEL):
+        row = PANEL * p
+        for c in range(row + lane, size, 2 * lanes):
+            d = wp.where(c + lanes < size, c + lanes, c)
+            write_panel(read_panel(a, env, row, c, d) - panel_sums(a, a, env, row, c, d, 0, row), a, env, row, c, d)
+        wait_for_block()
+        u = factored_panel(a, env, row)
+        for i in range(PANEL):
+            if u[i, i] == wp.float64(0.0):
+                return False
+        wait_for_block()
+        for c in range(row + PANEL + lane, size, 2 * lanes):
+            d = wp.where(c + lanes < size, c + lanes, c)
+            write_panel(substitute(u, read_panel(a, env, row, c, d)), a, env, row, c, d)
+        if lane == 0:
+            for i in range(PANEL):
+                for j in range(i, PANEL):
+                    a[env, row + i, row + j] = u[i, j]
+        wait_for_block()
+    return True
+
+
+@wp.func
+def factor_block(u: FloatArray3d, env: wp.int32, row: wp.int32) -> mat66d:
+    block = mat66d()
+    for i in range(PANEL):
+        for j in range(i, PANEL):
+            block[i, j] = u[env, row + i, row + j]
+    return block
+
+
+@wp.func
+def solve(u: FloatArray3d, b: FloatArray3d, y: FloatArray3d, env: wp.int32, size: wp.int32, lane: wp.int32, lanes: wp.int32):
+    """y = U⁻ᵀ b, with U of :func:`factor`."""
+    for c in range(lane, size, 2 * lanes):
+        d = wp.where(c + lanes < size, c + lanes, c)
+        for p in range(size / PANEL):
+            row = PANEL * p
+            x = read_panel(b, env, row, c, d) - panel_sums(u, y, env, row, c, d, 0, row)
+            write_panel(substitute(factor_block(u, env, row), x), y, env, row, c, d)
+    wait_for_block()
+
+
+@wp.func
+def solve_identity(u: FloatArray3d, y: FloatArray3d, env: wp.int32, size: wp.int32, lane: wp.int32, lanes: wp.int32):
+    """y = U⁻ᵀ, zero above its diagonal."""
+    one = wp.float64(1.0)
+    for c in range(lane, size, 2 * lanes):
+        d = wp.where(c + lanes < size, c + lanes, c)
+        first = c - c % PANEL
+        for p in range(size / PANEL):
+            row = PANEL * p
+            x = mat62d()
+            if row >= first:
+                x = -panel_sums(u, y, env, row, c, d, first, row)
+                for i in range(PANEL):
+                    if row + i == c:
+                        x[i, 0] = x[i, 0] + one
+                    if row + i == d:
+                        x[i, 1] = x[i, 1] + one
+                x = substitute(factor_block(u, env, row), x)
+            write_panel(x, y, env, row, c, d)
+    wait_for_block()
+
+
+@wp.func
+def gram(
+    b: FloatArray3d,
+    y: FloatArray3d,
+    is_lower: wp.bool,
+    out: FloatArray3d,
+    env: wp.int32,
+    size: wp.int32,
+    lane: wp.int32,
+    lanes: wp.int32,
+):
+    """out = b − yᵀ y, with the upper half of b; of a lower triangular y out = yᵀ y.
+
+    Warps take chunks of columns in turn.
+    """
+    width = wp.min(_WARP, lanes)
+    groups, group = lanes / width, lane / width
+    task = wp.int32(0)
+    for p in range(size / PANEL):
+        row = PANEL * p
+        for start in range(row, size, 2 * width):
+            c = start + lane % width
+            if task % groups == group and c < size:
+                d = wp.where(c + width < size, c + width, c)
+                x = mat62d()
+                if is_lower:
+                    x = panel_sums(y, y, env, row, c, d, c - c % PANEL, size)
+                else:
+                    x = read_panel(b, env, row, c, d) - panel_sums(y, y, env, row, c, d, 0, size)
+                for i in range(PANEL):
+                    if c >= row + i:
+                        out[env, row + i, c] = x[i, 0]
+                        out[env, c, row + i] = x[i, 0]
+                    if d >= row + i:
+                        out[env, row + i, d] = x[i, 1]
+                        out[env, d, row + i] = x[i, 1]
+            task += 1
+    wait_for_block()
