@@ -87,7 +87,7 @@ PLOTTED = {
     "min_det_f": ("smallest volume ratio\nof a tetrahedron", 1.0),
     "newton_mean": ("Newton iterations\na step, mean", 1.0),
     "lifted_m": ("height lifted [mm]", 1e3),
-    "drift": ("way of the object from\nwhere it lay first [µm]", 1e6),
+    "drift": ("drift of the object\nsince the first cycle [µm]", 1e6),
     "memory_mb": ("memory [MB]", 1.0),
 }
 
