@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -127,10 +128,12 @@ def test_two_checkouts_take_turns_and_the_ratio_is_that_of_the_medians(tmp_path:
     (other / "ipc").mkdir(parents=True)
     (other / "ipc" / "world.py").write_text("")
     calls: list[tuple[Path, str]] = []
+    started: list[int] = []
 
     class Turn:
-        def __init__(self, checkout: Path, scene: str) -> None:
+        def __init__(self, checkout: Path, scene: str, processes: int) -> None:
             self.checkout, self.scene = checkout, scene
+            started.append(processes)
 
         def step(self) -> tuple[float, float]:
             calls.append((self.checkout, self.scene))
@@ -150,6 +153,16 @@ def test_two_checkouts_take_turns_and_the_ratio_is_that_of_the_medians(tmp_path:
     assert found[f"push.fots.wall_speedup_vs_{name}"] == pytest.approx(6.0)
     written = read_metrics(tmp_path / "out" / "metrics.json")
     assert written[f"ball_rolling.rigid.speedup_vs_{name}"] == pytest.approx(3.0)
+    assert set(started) == {1}
+    calls.clear()
+    started.clear()
+    shared = bench.Args(out=tmp_path / "shared", device="cpu", modes="fots", against=other, rounds=1, envs=4, processes=2)
+    bench.main(shared)
+    assert {scene for _, scene in calls} == {"push:fots:2"} and set(started) == {2}
+    with pytest.raises(InputError, match="must be a multiple of the 2 processes"):
+        bench.main(replace(shared, envs=3))
+    with pytest.raises(InputError, match="must not have ball"):
+        bench.main(replace(shared, modes="ball"))
 
 
 @pytest.mark.slow

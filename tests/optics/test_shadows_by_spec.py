@@ -81,9 +81,9 @@ def test_a_table_is_baked_with_shadows_where_sensor_or_option_wants_them(monkeyp
 
 
 def test_a_sensor_without_shadows_is_baked_without_them() -> None:
-    settings = replace(BakeSettings.quick(), images=2, pins=2, n_bins=15)
+    settings = replace(BakeSettings.quick(), images=2, punches=3, pins=2, n_bins=15)
     baked = bake.bake(DARK, device="cpu", resolution=RESOLUTION, settings=settings)
-    assert baked.table.shadow is None and baked.images == 2 and not baked.calibration.tracer.shadows  # pyright: ignore[reportAttributeAccessIssue]
+    assert baked.table.shadow is None and baked.images == 5 and not baked.calibration.tracer.shadows  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_path_tracing_casts_shadows_and_says_so() -> None:
