@@ -91,8 +91,8 @@ class Coupled:
             [ScenePad(name, SENSOR, MESH, 0.2e-3) for name in pads], bodies, self.cases(), places, gravity=gravity, dt=interval
         )
         self.inputs = CouplingInputs(self.scene, list(self.links))
-        room = {"contacts": self.inputs.contacts, "solver_bodies": self.inputs.solver_bodies}
-        self.coupling = CCoupling([self.model], [self.data], list(self.links.values()), **room)
+        room, count = self.inputs.contacts, self.inputs.solver_bodies
+        self.coupling = CCoupling([self.model], [self.data], list(self.links.values()), contacts=room, solver_bodies=count)
         self.wrench = np.zeros((len(self.links), 6))
 
     def at(self, name: str) -> np.ndarray:
