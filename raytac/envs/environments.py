@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from raytac.envs.batch import StepResult, TaskBatch, TaskOptions
 from raytac.envs.task_rules import Task
+from raytac.envs.vector_checks import check_open, env_seeds
 from raytac.errors import InputError
 from raytac.gel.surface import chosen_envs
 from raytac.observe import gymnasium_space
@@ -48,13 +49,9 @@ class _TaskEnv:
         size = self.batch.control.size
         return gymnasium_space(self.batch.arrays), gymnasium.spaces.Box(-1.0, 1.0, (size,), np.float32)
 
-    def _check_open(self) -> None:
-        if self.closed:
-            raise InputError("environment", value="closed", rule="must not be used after close(): make another")
-
     def _pictures(self) -> tuple[np.ndarray, ...] | None:
         """Pictures of all environments; None without a render mode."""
-        self._check_open()
+        check_open(self.closed)
         if self.render_mode is None:
             return None
         if self._observation is None:
@@ -90,7 +87,7 @@ class TactileEnv(_TaskEnv, gymnasium.Env):
         ``options`` are ignored.
         Raises ``InputError`` after ``close``.
         """
-        self._check_open()
+        check_open(self.closed)
         super().reset(seed=seed)
         if seed is not None:
             self.batch.reseed([0], [seed])
@@ -102,7 +99,7 @@ class TactileEnv(_TaskEnv, gymnasium.Env):
 
         Raises ``InputError`` for an action of another shape, outside of [−1, 1] or not finite, or after ``close``.
         """
-        self._check_open()
+        check_open(self.closed)
         out = self.batch.step(np.asarray(action)[None])
         self._observation = out.observation
         info = {
@@ -174,17 +171,15 @@ class TactileVectorEnv(_TaskEnv, gymnasium.vector.VectorEnv):
 
         Raises ``InputError``: seeds of another number than environments, a mask of another shape, or after ``close``.
         """
-        self._check_open()
+        check_open(self.closed)
         mask = (options or {}).get("reset_mask")
         envs = chosen_envs(mask, self.num_envs)
-        if seed is not None:
-            seeds = [seed + b for b in range(self.num_envs)] if isinstance(seed, (int, np.integer)) else list(seed)
-            if len(seeds) != self.num_envs:
-                raise InputError("seed", value=len(seeds), rule=f"must be one, or one for each of {self.num_envs} environments")
-            seeded = [b for b in envs if seeds[b] is not None]
-            for b in seeded:
-                self._rngs[b] = seeding.np_random(int(seeds[b]))[0]  # type: ignore[arg-type]
-            self.batch.reseed(seeded, [int(seeds[b]) for b in seeded])  # type: ignore[arg-type]
+        seeds = env_seeds(seed, self.num_envs)
+        seeded = {b: one for b in envs if (one := seeds[b]) is not None}
+        for b, one in seeded.items():
+            self._rngs[b] = seeding.np_random(one)[0]
+        if seeded:
+            self.batch.reseed(list(seeded), list(seeded.values()))
         self._ended[envs] = False
         self._observation = self._reset(envs)
         return self._observation, {}
@@ -194,7 +189,7 @@ class TactileVectorEnv(_TaskEnv, gymnasium.vector.VectorEnv):
 
         Raises ``InputError`` for actions of another shape, outside of [−1, 1] or not finite, naming the environment; or after ``close``.
         """
-        self._check_open()
+        check_open(self.closed)
         # Those that are reset in place of this step.
         waiting = np.flatnonzero(self._ended) if self._mode is AutoresetMode.NEXT_STEP else np.zeros(0, int)
         actions = np.asarray(actions)

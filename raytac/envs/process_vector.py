@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 from raytac.device import cpu_cores
 from raytac.envs.environments import TactileVectorEnv
 from raytac.envs.processes import Workers, serve
+from raytac.envs.vector_checks import check_finite_actions, check_open, env_seeds
 from raytac.errors import InputError
 from raytac.gel.surface import chosen_envs
 
@@ -55,18 +56,12 @@ class ProcessVectorEnv(gymnasium.vector.VectorEnv):
 
         Raises ``InputError`` as it, and for a mask at the first reset, which must be of all.
         """
-        self._check_open()
+        check_open(self.closed)
         mask = (options or {}).get("reset_mask")
         if mask is not None and not self._begun:
             raise InputError("reset_mask", value="given", rule="must be None at the first reset, which is of all environments")
         chosen = np.isin(np.arange(self.num_envs), chosen_envs(mask, self.num_envs))
-        if seed is None or isinstance(seed, (int, np.integer)):
-            seeds = [None if seed is None else int(seed) + b for b in range(self.num_envs)]
-        else:
-            seeds = list(seed)
-            if len(seeds) != self.num_envs:
-                raise InputError("seed", value=len(seeds), rule=f"must be one, or one for each of {self.num_envs} environments")
-        each = self._workers.each
+        seeds, each = env_seeds(seed, self.num_envs), self._workers.each
         parts = [slice(k * each, (k + 1) * each) for k in range(len(self._workers))]
         self._workers.send("reset", [(seeds[part], chosen[part]) for part in parts])
         observations = self._workers.replies()
@@ -78,13 +73,11 @@ class ProcessVectorEnv(gymnasium.vector.VectorEnv):
 
         Raises ``InputError`` as it, with a note of the process: no process steps if an action is not finite or has another shape.
         """
-        self._check_open()
+        check_open(self.closed)
         actions = np.asarray(actions)
         if actions.shape != self.action_space.shape:
             raise InputError("actions", value=actions.shape, rule=f"must have the shape {self.action_space.shape}")
-        if not np.isfinite(actions).all():
-            env = int(np.argwhere(~np.isfinite(actions))[0, 0])
-            raise InputError("actions", value=actions[env].tolist(), rule=f"must be finite; in environment {env} they are not")
+        check_finite_actions(actions)
         self._workers.send("step", np.split(actions, len(self._workers)))
         observations, rewards, terminated, truncated, infos = zip(*self._workers.replies(), strict=True)
         ended = np.concatenate(terminated), np.concatenate(truncated)
@@ -93,10 +86,6 @@ class ProcessVectorEnv(gymnasium.vector.VectorEnv):
     def close_extras(self, **kwargs: Any) -> None:
         """End the processes."""
         self._workers.close()
-
-    def _check_open(self) -> None:
-        if self.closed:
-            raise InputError("environment", value="closed", rule="must not be used after close(): make another")
 
 
 def _serve_vector(pipe: Connection, kind: type[TactileVectorEnv], num_envs: int, options: dict[str, Any]) -> None:

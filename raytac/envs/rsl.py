@@ -17,7 +17,7 @@ from raytac.checks import check_whole
 from raytac.envs.environments import TactileVectorEnv
 from raytac.envs.flat import FlatLayout, FlatVector, serve_flat, shared_arrays, with_history
 from raytac.envs.processes import Workers
-from raytac.errors import InputError
+from raytac.envs.vector_checks import check_finite_actions
 from raytac.observe.settings import SCALES
 
 
@@ -99,9 +99,7 @@ class RslVecEnv(VecEnv):
         Raises ``InputError``: actions that are not finite; the message names the environment.
         """
         values = actions.detach().cpu().numpy()
-        if not np.isfinite(values).all():
-            env = int(np.argwhere(~np.isfinite(values))[0, 0])
-            raise InputError("actions", value=values[env].tolist(), rule=f"must be finite; in environment {env} they are not")
+        check_finite_actions(values)
         self._arrays["action"][:] = values
         if self._workers is None:
             assert self._vector is not None

@@ -25,7 +25,8 @@ Step = tuple[Observations, np.ndarray, np.ndarray, list[dict[str, Any]]]
 class TactileVecEnv(VecEnv):
     """A Gymnasium vector of ours as a ``VecEnv`` for ``MultiInputPolicy``.
 
-    Stable-baselines3 takes arrays of NumPy: those of a ``WarpVectorEnv`` are copied to the host in every step.
+    It may be a ``TactileVectorEnv``, a ``ProcessVectorEnv`` or a ``WarpVectorEnv``. Stable-baselines3 takes arrays of NumPy: tensors of a
+    ``WarpVectorEnv`` are copied to the host in every step.
 
     ``infos`` hold ``success``, ``failed``, ``TimeLimit.truncated``, and ``terminal_observation`` of episodes that have ended. One that
     ended because its physics broke down is not ``TimeLimit.truncated``: a learner must not expect a return from beyond it.

@@ -18,6 +18,7 @@ from raytac.checks import check_known, is_whole
 from raytac.envs.environments import checked_mode
 from raytac.envs.registration import TASKS
 from raytac.envs.task_rules import Task
+from raytac.envs.vector_checks import check_open
 from raytac.envs.warp_batch import WarpBatch
 from raytac.errors import InputError
 from raytac.observe import gymnasium_space
@@ -82,7 +83,7 @@ class WarpVectorEnv(gymnasium.vector.VectorEnv):
 
         Raises ``InputError`` for seeds of single environments, a mask of another shape, or after ``close``.
         """
-        self._check_open()
+        check_open(self.closed)
         if seed is not None and not is_whole(seed):
             raise InputError("seed", value=seed, rule="must be one whole number, of all environments")
         mask = (options or {}).get("reset_mask")
@@ -98,7 +99,7 @@ class WarpVectorEnv(gymnasium.vector.VectorEnv):
 
         Raises ``InputError`` also after ``close``.
         """
-        self._check_open()
+        check_open(self.closed)
         same = self._mode is AutoresetMode.SAME_STEP
         begin = None if same else self._ended if self._mode is AutoresetMode.NEXT_STEP else self._none
         out = self.batch.step(torch.as_tensor(actions), begin, final=same)
@@ -111,7 +112,3 @@ class WarpVectorEnv(gymnasium.vector.VectorEnv):
     def close_extras(self, **kwargs: Any) -> None:
         """Wait for the device. Raises ``InputError`` if contacts were lost for want of memory."""
         self.batch.check()
-
-    def _check_open(self) -> None:
-        if self.closed:
-            raise InputError("environment", value="closed", rule="must not be used after close(): make another")
