@@ -28,6 +28,7 @@ from raytac.learn import (
     shipped_policies,
     success_rate,
 )
+from tests.opengl import run_drawing
 
 
 def test_the_command_plays_a_scripted_policy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -158,13 +159,7 @@ def test_a_strip_shows_moments_that_differ() -> None:
 
 
 _SCRIPT = """
-import sys
-import gymnasium, mujoco, numpy as np
-try:
-    mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
-except Exception as error:
-    print(error)
-    sys.exit(77)
+import gymnasium
 import raytac.envs
 from raytac.envs import PushCubeVectorEnv
 from raytac.observe import ObservationSettings
@@ -194,13 +189,7 @@ many.close()
 
 
 def test_pictures_of_environments() -> None:
-    """In a process of its own: the GL backend is chosen when MuJoCo is imported."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    environment.setdefault("MUJOCO_GL", "egl")
-    done = subprocess.run([sys.executable, "-c", _SCRIPT], env=environment, capture_output=True, text=True, timeout=200)
-    if done.returncode == 77 or "EGL" in done.stderr or "OpenGL" in done.stderr:
-        pytest.skip(f"no offscreen OpenGL here: {(done.stdout + done.stderr).strip()[-200:]}")
-    assert done.returncode == 0, done.stderr
+    run_drawing(_SCRIPT, timeout=200.0)
 
 
 def test_a_render_mode_that_is_not_there() -> None:

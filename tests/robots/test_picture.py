@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,18 +10,12 @@ import numpy as np
 import pytest
 
 from raytac.io.images import read_png
+from tests.opengl import drawing_environment, run_drawing
 
 ROOT = Path(__file__).parents[2]
 
 _SCRIPT = """
-import sys
-import mujoco, numpy as np
 from raytac.robots.panda import READY, one_sensor_panda, two_finger_panda
-try:
-    mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
-except Exception as error:
-    print(error)
-    sys.exit(77)
 for make in (one_sensor_panda, two_finger_panda):
     robot = make()
     model = robot.spec.compile()
@@ -42,21 +35,13 @@ for make in (one_sensor_panda, two_finger_panda):
 """
 
 
-def _environment() -> dict[str, str]:
-    return {"MUJOCO_GL": "egl", **os.environ, "PYTHONPATH": os.pathsep.join(p for p in (str(ROOT), *sys.path) if p)}
-
-
 def test_every_link_and_a_sensor_are_seen():
-    """In a process of its own: the GL backend is chosen when MuJoCo is imported."""
-    done = subprocess.run([sys.executable, "-c", _SCRIPT], env=_environment(), capture_output=True, text=True, timeout=120)
-    if done.returncode == 77 or "EGL" in done.stderr or "OpenGL" in done.stderr:
-        pytest.skip(f"no offscreen OpenGL here: {(done.stdout + done.stderr).strip()[-200:]}")
-    assert done.returncode == 0, done.stderr
+    run_drawing(_SCRIPT)
 
 
 def test_the_picture_of_both_robots_is_drawn(tmp_path: Path):
     command = [sys.executable, str(ROOT / "experiments/robot_picture.py"), "--quick", "--out", str(tmp_path)]
-    done = subprocess.run(command, env=_environment(), capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, env=drawing_environment(), capture_output=True, text=True, timeout=120)
     if "MuJoCo cannot draw here" in done.stderr or "OpenGL" in done.stderr:
         pytest.skip(f"no offscreen OpenGL here: {done.stderr.strip()[-200:]}")
     assert done.returncode == 0, done.stderr

@@ -2,20 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-
-import pytest
+from tests.opengl import run_drawing
 
 _SCRIPT = """
-import sys
-import mujoco, numpy as np
-try:
-    mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
-except Exception as error:
-    print(error)
-    sys.exit(77)
 from raytac import TactileWorld, mount
 from raytac.world import SceneCamera
 
@@ -63,9 +52,4 @@ for degrees in (120.0, 30.0, -70.0):
 
 
 def test_a_shadow_is_darker_than_the_floor_and_falls_away_from_the_lamp() -> None:
-    """In a process of its own: the GL backend is chosen when MuJoCo is imported."""
-    environment = {"MUJOCO_GL": "egl", **os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    done = subprocess.run([sys.executable, "-c", _SCRIPT], env=environment, capture_output=True, text=True, timeout=120)
-    if done.returncode == 77 or "EGL" in done.stderr or "OpenGL" in done.stderr:
-        pytest.skip(f"no offscreen OpenGL here: {(done.stdout + done.stderr).strip()[-200:]}")
-    assert done.returncode == 0, done.stderr
+    run_drawing(_SCRIPT)
