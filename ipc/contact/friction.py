@@ -485,7 +485,7 @@ def guard_slips(
     # outputs
     lagged: Lagged,
 ):
-    """Chooses the next Newton step's curvature for pairs whose slip the step dx from x reverses.
+    """Choose the next Newton step's curvature for pairs whose slip the step dx from x reverses.
 
     Beyond ε the law has no curvature along the slip, and a pair may jump to and fro across the law's kink. One that would has all of the
     majoriser's curvature in the next step, and less and less in those after, since that converges slowly; it has none where the step

@@ -123,11 +123,11 @@ class PressArgs(ShadowOptions, SolverOptions):
         others = [name for name in (PHYSICS.name_of(physics), self.optics) if name not in ("rigid", "raytrace")]
         out = self.folder("press", "-".join([scene.name, *others]))
         written = run_press(sensor, scene, out, outputs=outputs, start=start, progress=True)
-        self._say_what_came_of_it(read_metrics(out / "metrics.json"))
+        self._log_result(read_metrics(out / "metrics.json"))
         return print_paths(written)
 
-    def _say_what_came_of_it(self, metrics: Mapping[str, Metric]) -> None:
-        """One line with the indentation, and with the force where it was asked for."""
+    def _log_result(self, metrics: Mapping[str, Metric]) -> None:
+        """Log the greatest indentation, and the force if it is among the outputs."""
         text = f"indentation up to {metrics['contact.max_indentation_mm']:.3f} mm"
         if "contact.force_z_n" in metrics:
             x, y, z = (metrics[f"contact.force_{axis}_n"] for axis in "xyz")

@@ -43,7 +43,7 @@ class Products:
         self.lanes = kernels.CPU_LANES if self.device.is_cpu else kernels.CUDA_LANES
         self._spans: dict[int, wp.array] = {}
         self.all = wp.full(num_envs, value=1, dtype=wp.int32, device=self.device)
-        """Mark every environment as active."""
+        """Mask in which every environment is active."""
 
     def zeros(self, rows: int, columns: int, num_envs: int | None = None) -> Matrices:
         """Matrices of zeros."""

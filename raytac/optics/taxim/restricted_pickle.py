@@ -121,7 +121,7 @@ class _Array:
 
 
 class _Plain:
-    """Replace stand-ins by their arrays, up to ``_MOST_ITEMS`` items."""
+    """Values with arrays in place of stand-ins, up to ``_MOST_ITEMS`` items."""
 
     def __init__(self) -> None:
         self._budget = _MOST_ITEMS

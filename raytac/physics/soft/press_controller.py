@@ -29,7 +29,7 @@ class PressController:
         self._is_free = scene.object.dynamics == "affine"
         self._weight = max((stage.force or 0.0 for stage in scene.trajectory), default=0.0)
         self.bar = Progress(desc="press", show=False)
-        """Count the solver's steps."""
+        """Counter of the solver's steps."""
         self._clear()
 
     def reset(self) -> None:

@@ -98,16 +98,16 @@ def calibrate(at: Calibration, *, settings: BakeSettings | None = None, seed: in
     with Progress(total=images, desc=f"bake {sensor.name}", unit="image", show=progress) as bar:
         touched, around, steep = (BinSums(settings.n_bins, camera.resolution) for _ in range(3))
         pad = sensor.gelpad, grid, camera, settings, seed
-        for presses, untouched in (
-            (ball_presses(*pad), around),
-            (ball_presses(*pad, bare=True), None),
-            (punch_presses(*pad), steep),
+        for presses, inside, outside in (
+            (ball_presses(*pad), touched, around),
+            (ball_presses(*pad, bare=True), touched, None),  # ends in a crease: the slopes beside it are those of no gel
+            (punch_presses(*pad), None, steep),
         ):
             for views in at.views(presses):
-                if untouched is not steep:
-                    add_samples(touched, views, at.rest_image, views.contact)
-                if untouched is not None:  # a bare cap ends in a crease: the slopes beside it are those of no gel
-                    add_samples(untouched, views, at.rest_image, ~views.contact)
+                if inside is not None:
+                    add_samples(inside, views, at.rest_image, views.contact)
+                if outside is not None:
+                    add_samples(outside, views, at.rest_image, ~views.contact)
                 bar.update(len(views.rgb))
         around = around.with_thin_bins_of(steep)
         fit, sheets = two_sheets(touched, around, neighbours=settings.neighbours, ridge=settings.ridge)
