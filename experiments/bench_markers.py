@@ -105,7 +105,9 @@ def main(args: Args) -> None:
         raise InputError("frames", value=args.frames, rule="must be at least 1")
     sensor = load_sensor(args.sensor)
     if sensor.marker_motion is None:  # its constants do not change the time much; their order of magnitude does
-        motion = MarkerMotionSpec(2.5e6, 1.6e4, 3.5e4, 1e-3, 9e4, 0.5, 0.2, 5.0, 1.0, "for timing", PunchSpec(0.7, 7e-3, 1.3e3))
+        motion = MarkerMotionSpec(
+            2.5e6, 1.6e4, 3.5e4, 1e-3, 9e4, 0.5, 0.2, 5.0, 1.0, "for timing", PunchSpec(0.7, 7e-3, 1.3e3, 2.5e6, 1.6e4)
+        )
         sensor = replace(sensor, marker_motion=motion)
     with recorded(args, "bench_markers", device=args.device, owned=("metrics.json",), packages=("warp-lang",)) as (_, metrics):
         count = sensor.markers.rows * sensor.markers.columns

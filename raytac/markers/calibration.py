@@ -123,9 +123,9 @@ def fit_motion(data: ProbeData, *, device: str = "auto") -> MarkerMotionSpec:
 
     They give the least mean distance, each kind of load weighted alike.
 
-    FOTS is fitted in stages, as its authors do: dilation on normal presses, then shear and twist with the dilation fixed. Shear and twist
-    are fitted once as published and once as a punch (``PunchSpec``), whose three constants they share. A cap is no more than the largest
-    motion in the data, since no larger one was measured.
+    FOTS is fitted in stages, as its authors do: dilation on normal presses, then shear and twist with the dilation fixed. All are fitted
+    once as published and once as a punch (``PunchSpec``), of which shear and twist share three constants. A cap is no more than the
+    largest motion in the data, since no larger one was measured.
     """
     from raytac.markers.fots import FotsKernel
 
@@ -144,15 +144,10 @@ def fit_motion(data: ProbeData, *, device: str = "auto") -> MarkerMotionSpec:
     caps = max(shear_most, 1e-6), max(twist_most, 1e-6)
     motion = MarkerMotionSpec(_GAIN, _LAMBDA, _LAMBDA, caps[0], _LAMBDA, caps[1], gain, stiffness, friction, provenance="")
 
-    def dilated(x: np.ndarray) -> MarkerMotionSpec:
-        return replace(motion, dilate_gain=_GAIN * math.exp(x[0]), dilate_lambda=_LAMBDA * math.exp(x[1]))
+    def dilated(gain: float, decay: float) -> MarkerMotionSpec:
+        return replace(motion, dilate_gain=gain, dilate_lambda=decay)
 
-    # Gain and λ trade off along a valley. A coarse search over λ selects where the fine one starts.
-    starts = (-1.0, 0.0, 1.0)
-    gains = [pattern_search(lambda x, at=at: error(dilated(np.array([x[0], at])), normal), np.zeros(1)) for at in starts]
-    best = min(range(3), key=lambda k: gains[k][1])
-    x, _ = pattern_search(lambda x: error(dilated(x), normal), np.array([gains[best][0][0], starts[best]]))
-    motion = dilated(x)
+    motion = dilated(*_fit_dilation(lambda gain, decay: error(dilated(gain, decay), normal)))
     for name, rows, most in (("shear", sheared, shear_most), ("twist", twisted, twist_most)):
         if len(rows) == 0:
             continue
@@ -169,16 +164,33 @@ def fit_motion(data: ProbeData, *, device: str = "auto") -> MarkerMotionSpec:
     if not dragged_rows:
         return motion
 
-    def punched(x: np.ndarray) -> MarkerMotionSpec:
-        return replace(motion, punch=PunchSpec(_logistic(x[0]), _REACH * math.exp(x[1]), slip_most * _logistic(x[2])))
+    def punched(gain: float, decay: float, x: np.ndarray) -> MarkerMotionSpec:
+        punch = PunchSpec(_logistic(x[0]), _REACH * math.exp(x[1]), slip_most * _logistic(x[2]), gain, decay)
+        return replace(motion, punch=punch)
+
+    dilation = _fit_dilation(lambda gain, decay: error(punched(gain, decay, np.zeros(3)), normal))
 
     def cost(x: np.ndarray) -> float:
-        return sum(error(punched(x), rows) for rows in dragged_rows)
+        return sum(error(punched(*dilation, x), rows) for rows in dragged_rows)
 
     # The cost does not depend on slip where nothing slips. A coarse search selects where it begins to.
     begin = min(np.linspace(-5.0, 3.0, 9), key=lambda at: cost(np.array([0.0, 0.0, at])))
     x, _ = pattern_search(cost, np.array([0.0, 0.0, begin]))
-    return punched(x)
+    return punched(*dilation, x)
+
+
+def _fit_dilation(error: Callable[[float, float], float]) -> tuple[float, float]:
+    """Gain [1/m³] and λ [1/m²] of the least error."""
+
+    def constants(x: np.ndarray) -> tuple[float, float]:
+        return _GAIN * math.exp(x[0]), _LAMBDA * math.exp(x[1])
+
+    # Gain and λ trade off along a valley. A coarse search over λ selects where the fine one starts.
+    starts = (-1.0, 0.0, 1.0)
+    gains = [pattern_search(lambda x, at=at: error(*constants(np.array([x[0], at]))), np.zeros(1)) for at in starts]
+    best = min(range(3), key=lambda k: gains[k][1])
+    x, _ = pattern_search(lambda x: error(*constants(x)), np.array([gains[best][0][0], starts[best]]))
+    return constants(x)
 
 
 def _logistic(x: float) -> float:

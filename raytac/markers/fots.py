@@ -30,6 +30,16 @@ linear in Δs and Δθ, so after slip these are
     Δs / (1 + γ), Δθ / (1 + b γ)      the least γ ≥ 0 that puts both within the ellipsoid      b = 1 / ``TWIST_SLIP``²
 
 (closest point, in elastic energy, as of ideal plasticity; b is the ratio of F_max Δs_max to M_max Δθ_max on incompressible rubber).
+
+A contact that sticks cannot spread. With a punch the dilation, which has constants of its own, is
+
+    dilate   max(0, 1 − Σ_c e_c) Δd_d                                    e_c = (2/π) (asin t − g)
+
+Pushed-apart skin is stretched by nearly the same, ε, all over a contact: Δd_d = ε x there. The disc holds it, and so adds the field of a
+disc that shrinks by ε. On a half-space radial tractions move the surface radially by the same integral as tangential ones move it around,
+up to a factor: û_r = (1 − ν) τ̂_r / (G k) and û_θ = τ̂_θ / (G k) in Hankel's transform of order 1. So the field of a stretched disc is
+Reissner and Sagoci's with x in place of ẑ × x: ε (2/π) (asin t − g) x. For ν → 1/2 these tractions move nothing along z, and pressure
+alone stretches nothing on a half-space: all of the dilation is the layer's.
 """
 
 from __future__ import annotations
@@ -161,6 +171,6 @@ def constants_of(motion: MarkerMotionSpec) -> Any:
     for name in ("dilate_gain", "dilate_lambda", "shear_lambda", "shear_max", "twist_lambda", "twist_max"):
         setattr(result, name, getattr(motion, name))
     result.is_punch = int(motion.punch is not None)
-    for name in ("anisotropy", "reach", "slip") if motion.punch else ():
+    for name in ("dilate_gain", "dilate_lambda", "anisotropy", "reach", "slip") if motion.punch else ():
         setattr(result, name, getattr(motion.punch, name))
     return result

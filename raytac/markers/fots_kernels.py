@@ -41,6 +41,7 @@ class Constants:
 
     dilate_gain: wp.float32
     dilate_lambda: wp.float32
+    """Both are the punch's own where there is one."""
     is_punch: wp.int32
     anisotropy: wp.float32
     reach: wp.float32
@@ -118,8 +119,11 @@ def beyond_ellipse(x: wp.vec2f, t: wp.vec3f) -> wp.float32:
 
 
 @wp.func
-def dragged(place: wp.vec2f, b: wp.int32, drags: wp.array2d(dtype=Drag), m: Constants) -> wp.vec2f:
-    """Shear and twist, by all contacts of pad ``b``, of a marker that is at ``place`` at rest."""
+def dragged(place: wp.vec2f, b: wp.int32, drags: wp.array2d(dtype=Drag), m: Constants):
+    """Shear and twist of a marker by all contacts of pad ``b``, and its share of dilation.
+
+    ``place``: of the marker at rest [m]. The share is what contacts that stick do not take away, 1 without a punch.
+    """
     shear, twist = wp.vec2f(), wp.vec2f()
     shear_sum, twist_sum = wp.float32(0.0), wp.float32(0.0)
     for k in range(drags.shape[1]):
@@ -147,7 +151,8 @@ def dragged(place: wp.vec2f, b: wp.int32, drags: wp.array2d(dtype=Drag), m: Cons
             twist += wt * turned
             shear_sum += ws
             twist_sum += wt
-    return shear / wp.max(1.0, shear_sum) + twist / wp.max(1.0, twist_sum)
+    free = wp.where(m.is_punch == 1, wp.max(1.0 - twist_sum, 0.0), 1.0)
+    return shear / wp.max(1.0, shear_sum) + twist / wp.max(1.0, twist_sum), free
 
 
 @wp.func
@@ -210,6 +215,8 @@ def displace(
         moved[b, i] = wp.vec2f()
         return
     place = xy[i]
-    drag = dragged(place, b, drags, motion)
-    gain = motion.dilate_gain * cells.pitch[0] * cells.pitch[1]
-    moved[b, i] = drag + gain * dilated(place + drag, b, box, depth, cells, motion.dilate_lambda)
+    drag, free = dragged(place, b, drags, motion)
+    gain = free * motion.dilate_gain * cells.pitch[0] * cells.pitch[1]
+    if gain > 0.0:
+        drag += gain * dilated(place + drag, b, box, depth, cells, motion.dilate_lambda)
+    moved[b, i] = drag

@@ -91,6 +91,8 @@ def displace(
     box = boxes[b]
     m = motion
     place = xy[b, i]
-    drag = dragged(place, b, drags, m)
-    gain = m.dilate_gain * cells.pitch[0] * cells.pitch[1]
-    moved[b, i] = drag + gain * dilated(place + drag, b, i, box, depth, cells, m.dilate_lambda, weights)
+    drag, free = dragged(place, b, drags, m)
+    gain = free * m.dilate_gain * cells.pitch[0] * cells.pitch[1]
+    if gain > 0.0:
+        drag += gain * dilated(place + drag, b, i, box, depth, cells, m.dilate_lambda, weights)
+    moved[b, i] = drag

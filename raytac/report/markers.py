@@ -56,7 +56,7 @@ class MotionReport:
     fit_errors: list[ModelError]
     """Errors of FOTS, and of FOTS as published, on the presses that both were fitted to."""
     by_press: list[tuple[str, ModelError]]
-    """Errors of FOTS by press, in words, under its last kind of load; those of the fit first."""
+    """Errors of FOTS by press, in words, and kind of load; those of the fit first."""
     times_ms: dict[str, float]
     """Median time of a frame of every model at the probes [ms]."""
     probes: int
@@ -145,7 +145,7 @@ def calibrate_markers(
     by_press = []
     for name, group in groupby([*fit, *held_out], key=lambda frame: str(frame.press)):
         rows, _ = model_errors(fitted, list(group), grid, models=("fots",), device=device)
-        by_press.append((name, rows[-1]))
+        by_press += [(name, row) for row in rows]
     markers = probe_sensor(sensor).markers
     report = MotionReport(motion, errors, fit_errors, by_press, times, markers.rows * markers.columns, held_out)
     return replace(report, motion=replace(motion, provenance=_provenance(sensor, report, fit, held_out, level, device)))
@@ -189,7 +189,7 @@ def motion_metrics(report: MotionReport) -> dict[str, Metric]:
     for name in ("dilate_gain", "dilate_lambda", "shear_lambda", "shear_max", "twist_lambda", "twist_max"):
         metrics[f"fots.{name}"] = getattr(motion, name)
     if motion.punch is not None:
-        metrics |= {f"punch.{name}": getattr(motion.punch, name) for name in ("anisotropy", "reach", "slip")}
+        metrics |= {f"punch.{name}": value for name, value in vars(motion.punch).items()}
     for name in ("field_gain", "field_shear", "field_friction"):
         metrics[name.replace("_", ".", 1)] = getattr(motion, name)
     for part, rows in (("held_out", report.errors), ("fit", report.fit_errors)):

@@ -20,6 +20,10 @@ class PunchSpec:
     """ℓ: length over which what a half-space would do fades in a pad of finite thickness [m]."""
     slip: float
     """c: contact sticks up to a shear of c times mean indentation times radius [1/m]."""
+    dilate_gain: float
+    """Gain of the dilation, of which a contact that sticks takes its share away [1/m³]."""
+    dilate_lambda: float
+    """λ_d of that dilation [1/m²]."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +31,7 @@ class MarkerMotionSpec:
     """Constants of the fitted marker models of one gelpad, whatever its pattern of dots."""
 
     dilate_gain: float
-    """Gain of FOTS' dilation, taken as an integral over the contact [1/m³]."""
+    """Gain of FOTS' dilation as published, taken as an integral over the contact [1/m³]."""
     dilate_lambda: float
     """λ_d of FOTS: how fast the dilation falls off around every contact point [1/m²]."""
     shear_lambda: float
@@ -47,7 +51,7 @@ class MarkerMotionSpec:
     provenance: str
     """Data, date and errors of the fit, as text."""
     punch: PunchSpec | None = None
-    """In place of FOTS' Gaussians and caps of shear and twist; None: those, as published."""
+    """In place of FOTS' Gaussians, caps and dilation; None: those, as published."""
     source: Path | None = None
     """File that it was read from."""
 
@@ -74,6 +78,8 @@ MARKER_MOTION_SCHEMA: Final[dict[str, Schema]] = {
         "anisotropy": Number("[0, 1]"),
         "reach_mm": Number("(0, 1000]"),
         "slip_per_mm": Number("[0, 1000]"),
+        "dilate_gain_per_mm3": Number("[0, 1000]"),
+        "dilate_lambda_per_mm2": Number("(0, 100]"),
     },
     "force_field": {
         "gain": Number("[0, 100]"),

@@ -16,9 +16,9 @@ from raytac.specs import PunchSpec, SensorSpec
 from tests.markers.pads import MOTION, fots_presses
 
 NU = 0.48
-HALF_SPACE = PunchSpec(NU / (2 - NU), 1e6, 1e9)
+HALF_SPACE = PunchSpec(NU / (2 - NU), 1e6, 1e9, 0.0, 1e5)
 """An elastic half-space on which nothing slips."""
-PAD = PunchSpec(0.7, 6e-3, 1e3)
+PAD = PunchSpec(0.7, 6e-3, 1e3, 0.0, 1e5)
 TURN = 9 * math.pi / 32 / 1.5
 """Spin at the edge over shear, each as far as it sticks alone."""
 PLACES = np.random.default_rng(0).uniform(-8e-3, 8e-3, (200, 2))
@@ -41,7 +41,8 @@ def moved(
     nothing = np.zeros((1, len(cells.y), len(cells.x)), dtype=np.float32)
     samples = nothing if depth is None else depth[None].astype(np.float32)
     box = np.array([[0, len(cells.x), 0, len(cells.y)]], dtype=np.uint32)
-    motion = replace(MOTION, dilate_gain=gain, dilate_lambda=1e5, shear_max=1e-3, twist_max=0.5, punch=punch)
+    motion = replace(MOTION, dilate_gain=gain, dilate_lambda=1e5, shear_max=1e-3, twist_max=0.5)
+    motion = replace(motion, punch=punch and replace(punch, dilate_gain=gain))
     return kernel.displacement(markers[None], samples, box, table, motion)[0].astype(float)
 
 
@@ -92,10 +93,10 @@ def by_loop(punch: PunchSpec, contacts: list[tuple[float, ...]], grid: PadGrid, 
             )
             et += w
         drag = shears / max(1.0, es) + twists / max(1.0, et)
-        total = drag.copy()
+        total, free = drag.copy(), max(0.0, 1 - et)
         for j, i in zip(*np.nonzero(depth), strict=True):
             e = np.array([mx, my]) + drag - (cells.x[i], cells.y[j])
-            total += gain * cells.area * depth[j, i] * e * math.exp(-1e5 * (e @ e))
+            total += free * gain * cells.area * depth[j, i] * e * math.exp(-1e5 * (e @ e))
         result.append(total)
     return np.array(result)
 
@@ -122,7 +123,7 @@ def test_under_the_contact_the_skin_is_the_object(grid: PadGrid) -> None:
     """Shear: as far as the object; twist: a rotation, no linear cross product, at 0.5 rad."""
     inside = PLACES[np.linalg.norm(PLACES, axis=1) < 3e-3]
     assert len(inside) > 10
-    still = PunchSpec(0.7, 6e-3, 1e5)
+    still = replace(PAD, slip=1e5)
     shear = (3e-4, -2e-4)
     np.testing.assert_allclose(
         moved(grid, still, [disc(3.4e-3, shear=shear)], inside), np.tile(shear, (len(inside), 1)), atol=1e-9

@@ -266,7 +266,7 @@ def test_images_for_a_learner(mode: str, device: str) -> None:
 
 
 def marker_sensor(model: str) -> SensorSpec:
-    motion = replace(MOTION, punch=PunchSpec(0.7, 6e-3, 1e3) if model == "fots-punch" else None)
+    motion = replace(MOTION, punch=PunchSpec(0.7, 6e-3, 1e3, 2e8, 1e5) if model == "fots-punch" else None)
     return replace(flat_sensor(), marker_motion=motion)
 
 
