@@ -44,15 +44,15 @@ class Args(CommonOptions):
 
 def draw_scene(axis: Any, world: TactileWorld, name: str, title: str) -> None:
     """Robot and body as MuJoCo draws them, around the pads."""
-    model = world.model  # of which only pictures are made from now on
+    distance, azimuth, elevation = VIEWS[name]
+    camera = SceneCamera(world, resolution=(480, 480), distance=distance, azimuth=azimuth, elevation=elevation)
+    model = camera.model
     model.site_rgba[:, 3] = 0.0
     for geom in map(model.geom, range(model.ngeom)):
         if geom.name.endswith("_collision") or model.body_mocapid[geom.bodyid.item()] >= 0:
             geom.matid[:], geom.rgba[3] = -1, 0.0  # robosuite has another shape to look at; Fetch's mocap body is a green cross
         elif geom.name in ("object0", *(f"{sensor}_case" for sensor in world.sensors)):
             geom.matid[:], geom.rgba[:] = -1, (0.8, 0.15, 0.1, 1.0) if geom.name == "object0" else (0.1, 0.3, 0.7, 1.0)
-    distance, azimuth, elevation = VIEWS[name]
-    camera = SceneCamera(world, resolution=(480, 480), distance=distance, azimuth=azimuth, elevation=elevation)
     model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.25, 0.25  # the packages' scenes have lights
     axis.imshow(camera.draw())
     camera.close()
