@@ -212,7 +212,7 @@ PROBES = (
     Probe(
         "mujoco", _MUJOCO, True,
         "pip install 'mujoco>=4.0,<5'; where MUJOCO_GL is set, unset it or install what it names (egl: libEGL, osmesa: libOSMesa)",
-    ),  # fmt: skip
+    ),
     Probe("exr", _EXR, True, "pip install 'OpenEXR>=3.3,<4'"),
     Probe("assets", _ASSETS, True, "reinstall raytac, or run it from a complete checkout"),
     Probe("figures, meshes", _FIGURES, True, "pip install matplotlib trimesh"),
