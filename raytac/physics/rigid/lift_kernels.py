@@ -101,7 +101,7 @@ def lift_of(slots: Slots, i: wp.int32, slot: wp.vec2i, law: vec6d) -> wp.float64
 
 @wp.func
 def settle_contact(slots: Slots, step: wp.float64, lifts: Lifts, i: wp.int32, k: wp.int32, most: wp.int32) -> wp.float64:
-    """Solve the law of one contact under the present forces of the others, by up to ``most`` steps.
+    """Solve the law of one contact under the forces of the others, by up to ``most`` steps.
 
     Returns the greatest change of a force [N]. The numbers of the contact stay in registers: a step reads no memory.
     """
