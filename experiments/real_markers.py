@@ -14,6 +14,13 @@ constant: a displacement that is the same for all dots (a gel that slides in its
 - ``markers.MODEL.rms_um``, ``….share``: root mean square distance of model and photographs, and over ``size_um``; ``….along_um`` of its
   component along the ball's motion alone, ``….outside_um`` of the dots that are not under the ball.
 - ``markers.MODEL.constant.…``: the same with a constant, ``….x_um`` and ``….y_um`` its value.
+
+``--vary NAME=A,B,…`` gives the gelpad each of some values, one property of ``VARIED``, with a constant. The value that is best on one half
+of the dots, every other one, is tested on the other half, whose dots had no part in it, nor in the constant:
+
+- ``varied.MODEL.A.rms_um``, ``….first_um``, ``….second_um``: of all dots, and of each half with a constant of its own.
+- ``varied.MODEL.tested_first``, ``….tested_first_um``: the value chosen on the second half, and the first half's error with it and with
+  the second half's constant; ``….tested_second…``: the other way round.
 """
 
 from __future__ import annotations
@@ -37,7 +44,7 @@ from raytac.gel import PadGrid, rest_height
 from raytac.io import CommonOptions, parse_names, read_png
 from raytac.markers import MARKERS, ContactCells, ContactTracker, MarkersConfig, camera_of, height_at, markers_config
 from raytac.physics import PadReading, Rigid, RigidPad, SoftPad
-from raytac.specs import PADS, ObjectSpec, PressScene, SensorSpec, StageSpec, load_sensor
+from raytac.specs import PADS, GelpadSpec, ObjectSpec, PressScene, SensorSpec, StageSpec, load_sensor
 
 PITCH = 0.1e-3
 """Spacing of the pad's nodes [m]."""
@@ -45,6 +52,13 @@ REACH, DARK, LEAST = 9.0, (0.1, 0.9), 15.0
 """Window of a dot's centroid [px]; darkness that counts not at all and wholly; least dark area of a dot [px]."""
 STEPS = 4
 """States of each of press and drag."""
+VARIED: dict[str, Callable[[GelpadSpec, str], GelpadSpec]] = {
+    "friction": lambda gel, value: replace(gel, friction=float(value)),
+    "thickness_mm": lambda gel, value: replace(gel, thickness=1e-3 * float(value)),
+    "size": lambda gel, value: replace(gel, size=(float(value) * gel.size[0], float(value) * gel.size[1])),
+    "bonded": lambda gel, value: replace(gel, bonded=value),
+}
+"""Properties of the gelpad that may be varied; ``size`` is over the sensor's own."""
 UNDER = 0.9
 """Dots within so many radii of the circle's centre move with the ball."""
 
@@ -67,6 +81,8 @@ class Args(CommonOptions):
     """Level of the soft pad that surface tracking needs."""
     sensor: str = "gelsight_mini"
     """Sensor whose gelpad and marker motion are used."""
+    vary: str = ""
+    """Property of the gelpad and its values, as friction=0.3,0.5,1; see the module's text. None if empty."""
 
 
 @dataclass(frozen=True)
@@ -152,8 +168,10 @@ def rigid_motion(places: np.ndarray, motion: np.ndarray, centre: np.ndarray) -> 
 class Dragged:
     """A ball pressed and dragged on a pad of ``sensor``, and where the dots of the photographs go in every model."""
 
-    def __init__(self, sensor: SensorSpec, place: np.ndarray, radius: float, depth: float, level: str, device: str) -> None:
-        """``place`` (2,) [m], ``radius`` and ``depth`` of the ball [m]; ``level`` of the soft pad."""
+    def __init__(self, sensor: SensorSpec, pressed: PressedBall, radius: float, level: str, device: str) -> None:
+        """``pressed``: as of ``pressed_ball``; ``radius`` of the ball [m]; ``level`` of the soft pad."""
+        assert pressed.surface is not None
+        place, depth = pressed.surface.contact_centre[0], pressed.depth
         self.sensor, self.level, self.device, self.camera = sensor, level, device, camera_of(sensor)
         self.depth, ball = (
             depth,
@@ -227,6 +245,41 @@ def compared(
     return difference - constant, constant
 
 
+def varied(gelpad: GelpadSpec, text: str) -> tuple[str, dict[str, GelpadSpec]]:
+    """Property of ``NAME=A,B,…``, and the gelpad with each of its values; errors as of the gelpad's own checks."""
+    name, _, values = text.partition("=")
+    parse_names(name, "vary", tuple(VARIED))
+    if len(set(values.split(","))) < 2:
+        raise InputError("vary", value=text, rule="must name a property and two or more values, as friction=0.3,0.5,1")
+    try:
+        return name, {value: VARIED[name](gelpad, value) for value in values.split(",")}
+    except ValueError as error:
+        raise InputError("vary", value=text, rule=f"must have values that the property takes: {error}") from error
+
+
+def chosen_by_halves(
+    drag: Drag, pads: dict[str, Dragged], model: str, name: str, own: tuple[np.ndarray, float], pitch_um: float
+) -> dict[str, float | str]:
+    """Metrics of pads by value: each half of the dots tested with the value and the constant that are best on the other."""
+    print(f"| {model}: {name} | RMS [µm] | first half alone | second half alone |\n|---|---|---|---|", flush=True)
+    differences, metrics = {}, {}
+    halves = {"first": slice(0, None, 2), "second": slice(1, None, 2)}
+    for value, dragged in pads.items():
+        difference, _ = compared(drag, dragged, markers_config(model), own, True)
+        differences[value] = pitch_um * difference
+        alone = [_rms(d - d.mean(axis=0)) for d in (differences[value][half] for half in halves.values())]
+        rms = metrics[f"varied.{model}.{value}.rms_um"] = _rms(differences[value])
+        metrics |= {f"varied.{model}.{value}.{half}_um": own_rms for half, own_rms in zip(halves, alone, strict=True)}
+        print(f"| {value} | {' | '.join(f'{one:.1f}' for one in (rms, *alone))} |", flush=True)
+    for tested, other in (("first", "second"), ("second", "first")):
+        best = min(differences, key=lambda value: metrics[f"varied.{model}.{value}.{other}_um"])
+        difference = differences[best]
+        rms = _rms(difference[halves[tested]] - difference[halves[other]].mean(axis=0))
+        metrics |= {f"varied.{model}.tested_{tested}": best, f"varied.{model}.tested_{tested}_um": rms}
+        print(f"{tested} half, with what the other chose ({name} {best}): {rms:.1f} µm", flush=True)
+    return metrics
+
+
 def main(args: Args) -> None:
     for name in ("ball_radius_mm", "pitch_mm"):
         check_number(name, getattr(args, name), "(0, 100]", "mm")
@@ -238,12 +291,21 @@ def main(args: Args) -> None:
     sensor = photographed(load_sensor(args.sensor), drag.size, args.pitch_mm / 1e3)
     radius, pitch_um = args.ball_radius_mm / 1e3, 1e3 * args.pitch_mm
     ball = pressed_ball(sensor, circle, radius, device)
-    assert ball.surface is not None
     under = np.hypot(*(drag.before - circle[:2]).T) < UNDER * circle[2]
     if under.sum() < 2:
         raise InputError("circle_px", value=args.circle_px, rule="must have at least two dots inside")
     own = rigid_motion(drag.before[under], drag.motion[under], circle[:2])
-    dragged = Dragged(sensor, ball.surface.contact_centre[0], radius, ball.depth, args.level, device)
+    if args.vary:
+        name, gelpads = varied(sensor.gelpad, args.vary)
+        pads = {}
+        for value, gelpad in gelpads.items():
+            own_sensor = replace(sensor, gelpad=gelpad)
+            pads[value] = Dragged(own_sensor, pressed_ball(own_sensor, circle, radius, device), radius, args.level, device)
+        with recorded(args, "real_markers", device=device) as (_, metrics):
+            for model in models:
+                metrics |= chosen_by_halves(drag, pads, model, name, own, pitch_um)
+        return
+    dragged = Dragged(sensor, ball, radius, args.level, device)
     with recorded(args, "real_markers", device=device) as (_, metrics):
         size = _rms(drag.motion) * pitch_um
         metrics |= {"markers.dots": len(drag.before), "markers.lost": drag.lost, "markers.size_um": size}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +83,10 @@ def test_files_of_forces_that_say_nothing_are_refused(tmp_path: Path) -> None:
         real_force.main(real_force.Args(data=data, radius_mm=5.0, levels="", poisson_ratios="0.6", device="cpu"))
 
 
+UNKNOWN = ("vary", "colour=1,2"), ("vary", "friction=1"), ("vary", "friction=a,b"), ("vary", "bonded=back,glue")
+"""Variations of the gelpad that are refused."""
+
+
 def photograph(centres: np.ndarray, radius: float = 4.6) -> np.ndarray:
     """Dark round dots on a bright ground that is uneven, with edges one pixel wide."""
     v, u = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
@@ -128,7 +132,7 @@ def test_a_model_recovers_its_own_drag_with_its_constant(tmp_path: Path, dots: n
     sensor = real_markers.photographed(load_sensor("gelsight_mini"), SIZE, PITCH / 1e3)
     ball = real_markers.pressed_ball(sensor, CIRCLE, BALL, "cpu")
     assert ball.surface is not None
-    dragged = real_markers.Dragged(sensor, ball.surface.contact_centre[0], BALL, ball.depth, "coarse", "cpu")
+    dragged = real_markers.Dragged(sensor, ball, BALL, "coarse", "cpu")
     motion = dragged.motion(markers_config("fots"), dots, DRAG * PITCH / 1e3, TURN) + CONSTANT
     data = drag_folder(tmp_path, dots, dots + motion)
     args: dict[str, Any] = {
@@ -148,11 +152,36 @@ def test_a_model_recovers_its_own_drag_with_its_constant(tmp_path: Path, dots: n
     assert float(metrics["markers.force_field.constant.rms_um"]) > 4.0 * fots["constant.rms_um"]
 
 
+@dataclass(frozen=True)
+class Scaled:
+    """Dots of one value of a varied gelpad: they go along by a share, the second half by another."""
+
+    shares: tuple[float, float]
+    sensor = load_sensor("gelsight_mini")
+
+    def motion(self, _: Any, before: np.ndarray, drag: np.ndarray, __: float) -> np.ndarray:
+        across = drag / np.asarray(self.sensor.camera.pixel_pitch) * (before[:, :1] - before[:, 0].mean()) / 100.0
+        return across * np.array([self.shares[k % 2] for k in range(len(before))])[:, None]
+
+
+def test_a_value_is_chosen_on_one_half_of_the_dots_and_tested_on_the_other(dots: np.ndarray) -> None:
+    """Photographs in which the first half goes along by 1 and the second by 2: each is tested with the other's choice."""
+    own = np.array([2.0, 8.0]), 0.0
+    pads: Any = {str(k): Scaled((share, share)) for k, share in enumerate((0.5, 1.0, 2.0))}
+    seen = Scaled((1.0, 2.0)).motion(None, dots, own[0] * np.asarray(Scaled.sensor.camera.pixel_pitch), 0.0)
+    drag = real_markers.Drag(dots, dots + seen, 0, SIZE)
+    metrics = real_markers.chosen_by_halves(drag, pads, "surface", "friction", own, 10.0)
+    assert (metrics["varied.surface.tested_first"], metrics["varied.surface.tested_second"]) == ("2", "1")
+    assert float(metrics["varied.surface.1.first_um"]) < 1.0 and float(metrics["varied.surface.2.second_um"]) < 1.0
+    apart = np.linalg.norm(seen[::2], axis=1)  # by as much as the second half's share is larger
+    assert float(metrics["varied.surface.tested_first_um"]) == pytest.approx(10.0 * np.sqrt((apart**2).mean()), rel=0.03)
+
+
 def test_drags_without_their_files_are_refused(tmp_path: Path, dots: np.ndarray) -> None:
     with pytest.raises(InputError, match=r"0\.png and 1\.png"):
         real_markers.Drag.read(tmp_path)
     data = drag_folder(tmp_path, dots, dots)
-    for name, text in (("circle_px", "1,2"), ("circle_px", "20,20,3"), ("models", "none"), ("level", "huge")):
+    for name, text in (("circle_px", "1,2"), ("circle_px", "20,20,3"), ("models", "none"), ("level", "huge"), *UNKNOWN):
         args: dict[str, Any] = {"circle_px": "150,118,36", "ball_radius_mm": 3.0, "pitch_mm": PITCH, "device": "cpu"} | {
             name: text
         }
