@@ -182,7 +182,7 @@ def gram(y: FloatArray3d, out: FloatArray3d, env: wp.int32, size: wp.int32, lane
 
 @wp.func
 def invert(a: FloatArray3d, y: FloatArray3d, env: wp.int32, size: wp.int32, lane: wp.int32, lanes: wp.int32) -> wp.bool:
-    """A⁻¹ = U⁻¹ U⁻ᵀ takes the place of A, of which the upper half is read; y becomes U⁻ᵀ.
+    """A⁻¹ = U⁻¹ U⁻ᵀ takes the place of A, of which the upper half counts; y becomes U⁻ᵀ.
 
     All threads get the same result: False where a pivot is not positive.
     """
