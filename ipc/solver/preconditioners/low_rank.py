@@ -9,8 +9,10 @@ A = L Lᵀ is factored in each Newton iteration. By Woodbury's identity
 The second form needs no inverse of S, which is not regular where friction is missing. An affine body is 10⁶ times as stiff against strain
 as against motion: its unknowns are Lᵀ x and its rows L⁻¹ q here, for which K = 1; otherwise the difference would be lost to rounding.
 Inverses are computed in double precision by one block of threads an environment (``dense.py``). W itself is not: it is needed for few
-products in a Newton iteration, and three matrices times a vector have less arithmetic than a product of matrices. An environment with more contact
-nodes than there is room for is marked as one that does not fit: with part of its contacts the identity is of little use.
+products in a Newton iteration, and three matrices times a vector have less arithmetic than a product of matrices.
+
+An environment with more contact nodes than there is room for is marked as one that does not fit: with part of its contacts the identity is
+of little use.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
