@@ -216,6 +216,10 @@ class Potential:
         """Contacts at x, with forces and rows of the barrier."""
         self.collision.touch(self.x, self.R, self.t, self.kappa, active, self.vert_gradient, self.barrier)
 
+    def add_friction(self, active: wp.array) -> None:
+        """Friction's forces and rows, once after each :meth:`touch`."""
+        self.collision.add_friction(self.x, self.x_start, self.friction_eps, self.last, active, self.vert_gradient)
+
     def assemble(self, active: wp.array, *, touched: bool = False) -> None:
         """Forces, contacts and energies at y; ``residual`` is −``gradient`` on the unknowns.
 
@@ -226,7 +230,7 @@ class Potential:
         self.launch(elasticity.node_elastic_gradient, self.y.shape, inputs, [self.gradient])
         if not touched:
             self.touch(active)
-        self.collision.add_friction(self.x, self.x_start, self.friction_eps, self.last, active, self.vert_gradient)
+        self.add_friction(active)
         if len(self.summed_nodes):
             threads = BLOCK if self.device.is_cuda else 1
             inputs, outputs = [self.vert_gradient, self.verts, self.summed_nodes, active, threads], [self.summed_gradient]
