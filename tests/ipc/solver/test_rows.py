@@ -1,5 +1,8 @@
 """Contact rows over the unknowns of soft nodes and of one or two affine bodies: products, and their part in the rest inverse."""
 
+# pyright: reportInvalidTypeForm=false, reportCallIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false
+
 from __future__ import annotations
 
 from typing import Any
@@ -9,8 +12,11 @@ import pytest
 import warp as wp
 
 import ipc
+from ipc.arrays import FloatArray, VecArray2d
+from ipc.contact.contacts import Contacts
 from ipc.reduce import BLOCK
-from ipc.solver.linear import multiply_blocks, multiply_rows
+from ipc.solver.halves import multiply_half
+from ipc.solver.linear import SystemView, multiply_blocks, multiply_rows
 from ipc.solver.preconditioners.rest_inverse import RestInverse
 from tests.ipc.conftest import bonded_pad, small_pad
 
@@ -23,7 +29,7 @@ DEVICES = [
 class Rows:
     """A pad at rest, two affine boxes far from it, and random contact rows between all; H as a dense matrix."""
 
-    def __init__(self, count: int, rng: np.random.Generator, device: str) -> None:
+    def __init__(self, count: int, rng: np.random.Generator, device: str, faces: int = 0) -> None:
         boxes: list[ipc.Body] = [
             ipc.AffineBody(f"box{k}", ipc.box_surface((2e-3, 2e-3, 2e-3)), pose=ipc.Pose((5e-3 * k, 0.0, 0.1))) for k in range(2)
         ]
@@ -50,9 +56,11 @@ class Rows:
             *([choose(bonded), choose(soft), *choose(one, 2, False)] for _ in range(5)),
             *([*choose(soft, 4, False)] for _ in range(5)),
         ]
+        own = layout.faces[(layout.vert_body[layout.faces] == 0).all(axis=1)]
+        verts += [[*face, -1] for face in np.repeat(choose(own, faces, False), 2, axis=0)]
         self.verts, n = np.array(verts), len(verts)
         rows = 10 ** rng.uniform(0, 2, (n, 1, 1)) * rng.normal(size=(n, 3, 4)) * (self.verts >= 0)[:, None]
-        concave = np.zeros(n, int)
+        concave = (np.arange(n) >= n - faces).astype(int)
         self._put("row_verts", self.verts)
         self._put("row", rows)
         self._put("concave", concave)
@@ -98,6 +106,31 @@ def test_products_are_those_of_the_rows(device: str, rng: np.random.Generator) -
     rows.pot.collision.contacts.row_count.zero_()
     result, expected = with_rows - rows.product(p), rows.q.T @ (rows.q @ p)
     np.testing.assert_allclose(result, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+@wp.kernel
+def half_product(system: SystemView, contacts: Contacts, p: VecArray2d, out: VecArray2d, total: FloatArray):
+    env = wp.tid()
+    total[env] = multiply_half(system, contacts, env, p, out)
+
+
+@pytest.mark.parametrize("project", [0, 1])
+def test_products_with_the_upper_half_are_those_with_blocks_and_rows(project: int, rng: np.random.Generator) -> None:
+    """Rows at the nodes of one face are added to blocks, those of affine bodies and of distant nodes are not."""
+    rows = Rows(12, rng, "cpu", faces=6)
+    pot, contacts = rows.pot, rows.pot.collision.contacts
+    pot.project.fill_(project)
+    p = rng.normal(size=rows.q.shape[1]) * np.repeat(rows.layout.node_free, 3)
+    expected = rows.product(p)
+    pot.fold_rows(pot.everyone)
+    is_open = np.zeros(len(rows.verts), bool)
+    is_open[contacts.open_row.numpy()[0, : contacts.open_count.numpy()[0]]] = True
+    assert is_open[:-12].sum() > 20 and not is_open[-12:].any()
+    x, out = (wp.array(a.reshape(1, -1, 3), dtype=wp.vec3d, device="cpu") for a in (p, np.zeros_like(p)))
+    total = wp.zeros(1, dtype=wp.float64, device="cpu")
+    wp.launch(half_product, dim=1, inputs=[pot.system, contacts, x, out, total], device="cpu")
+    np.testing.assert_allclose(out.numpy().ravel(), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    assert total.numpy()[0] == pytest.approx(p @ expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("count", [11, 40])
