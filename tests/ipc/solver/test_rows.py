@@ -17,6 +17,7 @@ from ipc.contact.contacts import Contacts
 from ipc.reduce import BLOCK
 from ipc.solver.halves import multiply_half
 from ipc.solver.linear import SystemView, multiply_blocks, multiply_rows
+from ipc.solver.potential import Potential
 from ipc.solver.preconditioners.rest_inverse import RestInverse
 from tests.ipc.conftest import bonded_pad, small_pad
 
@@ -84,18 +85,30 @@ class Rows:
 
     def product(self, p: np.ndarray) -> np.ndarray:
         """H p, blocks and rows, of all nodes."""
-        pot, device, threads = self.pot, self.world.device, BLOCK if self.world.device.is_cuda else 1
-        x, out = (wp.array(a.reshape(1, -1, 3), dtype=wp.vec3d, device=device) for a in (p, np.zeros_like(p)))
-        lanes = pot.collision.lanes
+        return whole_product(self.pot, p)
 
-        def launch(kernel: Any, chunks: int, inputs: list) -> None:
-            partial = wp.zeros((1, chunks), dtype=wp.float64, device=device)
-            wp.launch(kernel, dim=(1, chunks, threads), inputs=inputs, outputs=[out, partial], device=device, block_dim=BLOCK)
 
-        launch(multiply_blocks, 1, [pot.system, x, pot.everyone, threads])
-        inputs = [pot.system, pot.collision.contacts, x, pot.everyone, lanes, threads]
-        launch(multiply_rows, -(-lanes // BLOCK), inputs)
-        return out.numpy().ravel()
+def whole_product(pot: Potential, p: np.ndarray) -> np.ndarray:
+    """H p of a matrix that has all its blocks, volumes apart, and its contact rows."""
+    device, lanes = pot.device, pot.collision.lanes
+    threads = BLOCK if device.is_cuda else 1
+    x, out = (wp.array(a.reshape(1, -1, 3), dtype=wp.vec3d, device=device) for a in (p, np.zeros_like(p)))
+
+    def launch(kernel: Any, chunks: int, inputs: list) -> None:
+        partial = wp.zeros((1, chunks), dtype=wp.float64, device=device)
+        wp.launch(kernel, dim=(1, chunks, threads), inputs=inputs, outputs=[out, partial], device=device, block_dim=BLOCK)
+
+    launch(multiply_blocks, 1, [pot.system, x, pot.everyone, threads])
+    launch(multiply_rows, -(-lanes // BLOCK), [pot.system, pot.collision.contacts, x, pot.everyone, lanes, threads])
+    return out.numpy().ravel()
+
+
+def half_product(pot: Potential, p: np.ndarray) -> tuple[np.ndarray, float]:
+    """H p by the upper half, and p·H p."""
+    x, out = (wp.array(a.reshape(1, -1, 3), dtype=wp.vec3d, device="cpu") for a in (p, np.zeros_like(p)))
+    total = wp.zeros(1, dtype=wp.float64, device="cpu")
+    wp.launch(multiply_by_half, dim=1, inputs=[pot.system, pot.collision.contacts, x, out, total], device="cpu")
+    return out.numpy().ravel(), float(total.numpy()[0])
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -109,7 +122,7 @@ def test_products_are_those_of_the_rows(device: str, rng: np.random.Generator) -
 
 
 @wp.kernel
-def half_product(system: SystemView, contacts: Contacts, p: VecArray2d, out: VecArray2d, total: FloatArray):
+def multiply_by_half(system: SystemView, contacts: Contacts, p: VecArray2d, out: VecArray2d, total: FloatArray):
     env = wp.tid()
     total[env] = multiply_half(system, contacts, env, p, out)
 
@@ -126,11 +139,33 @@ def test_products_with_the_upper_half_are_those_with_blocks_and_rows(project: in
     is_open = np.zeros(len(rows.verts), bool)
     is_open[contacts.open_row.numpy()[0, : contacts.open_count.numpy()[0]]] = True
     assert is_open[:-12].sum() > 20 and not is_open[-12:].any()
-    x, out = (wp.array(a.reshape(1, -1, 3), dtype=wp.vec3d, device="cpu") for a in (p, np.zeros_like(p)))
-    total = wp.zeros(1, dtype=wp.float64, device="cpu")
-    wp.launch(half_product, dim=1, inputs=[pot.system, contacts, x, out, total], device="cpu")
-    np.testing.assert_allclose(out.numpy().ravel(), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-    assert total.numpy()[0] == pytest.approx(p @ expected, rel=1e-12)
+    result, total = half_product(pot, p)
+    np.testing.assert_allclose(result, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    assert total == pytest.approx(p @ expected, rel=1e-12)
+
+
+def test_products_do_without_the_blocks_that_are_left_out(rng: np.random.Generator) -> None:
+    """A pad alone, whose blocks below the diagonal and of bonded nodes nobody reads; stretched, against the whole matrix."""
+    products, p = [], None
+    for preconditioner in ("block_jacobi", "rest_inverse"):
+        settings = ipc.Settings(dt=0.01, linear_tolerance=1e-6, preconditioner=preconditioner)
+        world = ipc.World([bonded_pad(small_pad((7, 6, 1)))], settings, device="cpu")
+        layout, pot = world.layout, world._newton.potential
+        free = layout.node_free[:, None] * np.ones(3)
+        if p is None:
+            p, stretch = rng.normal(size=free.shape) * free, 2e-5 * rng.normal(size=free.shape) * free
+        pot.set_frames(wp.zeros(1, dtype=wp.float64, device="cpu"), pot.R, pot.t)
+        pot.y.assign(pot.y.numpy() + stretch)
+        pot.place_vertices(pot.y, pot.R, pot.t, pot.x)
+        pot.aim_inertia(pot.R, pot.t)
+        pot.assemble(pot.everyone)
+        pot.fill_matrix(pot.everyone)
+        pot.fold_rows(pot.everyone)
+        assert pot.mirrors == (preconditioner == "rest_inverse")
+        products.append(whole_product(pot, p) if pot.mirrors else half_product(pot, p)[0])
+    whole = products[1]
+    np.testing.assert_allclose(products[0], whole, rtol=0, atol=1e-12 * np.abs(whole).max())
+    assert np.abs(whole.reshape(-1, 3)[layout.node_free != 0]).min() > 0
 
 
 @pytest.mark.parametrize("count", [11, 40])
