@@ -1,19 +1,22 @@
 # raytac on a CPU, or on CUDA with another base image.
 #
 #   docker build -t raytac .
-#   docker run --rm -v "$PWD/runs:/work/runs" raytac press coin
+#   docker run --rm -v raytac-cache:/root/.cache -v "$PWD/runs:/work/runs" raytac press coin
 #
 #   docker build -t raytac-cuda --build-arg BASE=nvidia/cuda:12.8.1-runtime-ubuntu24.04 --build-arg EXTRAS=gpu,ipc,robots .
-#   docker run --rm --gpus all -e NVIDIA_DRIVER_CAPABILITIES=all -v "$PWD/runs:/work/runs" raytac-cuda press coin --device cuda
+#   docker run --rm --gpus all -v raytac-cache:/root/.cache -v "$PWD/runs:/work/runs" raytac-cuda press coin --device cuda
 #
+# The volume raytac-cache keeps compiled kernels, which take up to a minute, for the next container.
 # Ray tracing on CUDA needs OptiX, which the host's driver brings: NVIDIA_DRIVER_CAPABILITIES must contain "graphics".
 ARG BASE=ubuntu:24.04
 FROM ${BASE}
 ARG EXTRAS=ipc,robots
 
-# libosmesa6 draws MuJoCo's pictures without a screen; the other libraries are for tetrahedra (pyvista) and pictures.
+# EGL draws MuJoCo's pictures without a screen: Mesa's on a CPU, the driver's own on CUDA. The last three libraries are for tetrahedra
+# (pyvista) and pictures.
 RUN apt-get update \
- && apt-get install --yes --no-install-recommends python3 python3-venv libosmesa6 libgl1 libxrender1 libgomp1 \
+ && apt-get install --yes --no-install-recommends python3 python3-venv \
+      libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0 libgl1 libxrender1 libgomp1 \
  && rm -rf /var/lib/apt/lists/*
 
 WORKDIR /opt/raytac
@@ -24,7 +27,7 @@ COPY scenes scenes
 COPY lights lights
 RUN python3 -m venv /opt/venv && /opt/venv/bin/pip install --no-cache-dir ".[${EXTRAS}]"
 
-ENV PATH=/opt/venv/bin:$PATH MUJOCO_GL=osmesa NVIDIA_DRIVER_CAPABILITIES=all
+ENV PATH=/opt/venv/bin:$PATH MUJOCO_GL=egl NVIDIA_DRIVER_CAPABILITIES=all
 WORKDIR /work
 ENTRYPOINT ["raytac"]
 CMD ["doctor"]

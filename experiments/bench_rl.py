@@ -26,8 +26,8 @@ and times are the mean over steps, since nothing waits in between.
 With ``--physics ipc`` pads are soft, of ``--task``, and nothing is observed if no mode is named. Keys are ``cpu.push.ipc.<key>`` (``gpu.``
 where the solver runs on CUDA; ``roll`` for RollBall), with the mode before the last part if it is not ``none``. Besides the speed they say
 what an environment takes in a control step on average: ``solves`` of the contact solver, its ``newton`` iterations and the ``linear``
-iterations of their conjugate gradients; and ``asleep``, in which share of the steps it was not solved at all. ``approach.<key>`` is of the
-first third of as many steps more, until the pad is on the body.
+iterations of their conjugate gradients; and ``asleep``, in which share of the steps it was not solved at all. The pad comes down, and then
+holds about 1 N. ``approach.<key>`` is of the first third of as many steps more, until the pad is on the body.
 
 ``--frames`` leaves physics out: how many images of ``--size`` a second of ``--envs`` pads that are pressed, each differently? The gel's
 heights are on the device when the clock starts; cut, difference to rest and hand-over to PyTorch (DLPack) are in the time, and the image
@@ -63,8 +63,10 @@ from raytac.report import machine
 from raytac.sensor import TactileSensor
 from raytac.shapes import object_height, primitive
 
-TASKS = {"PushCube": ("push", PushCubeVectorEnv), "RollBall": ("roll", RollBallVectorEnv)}
-"""Tasks with soft pads: the name in keys, and the vector of environments."""
+TASKS = {"PushCube": ("push", PushCubeVectorEnv, 0.03), "RollBall": ("roll", RollBallVectorEnv, 0.3)}
+"""Tasks with soft pads: the name in keys, the vector of environments, and the action along z for each newton too many.
+
+A cube's face is so stiff against a pad that more of it would make the pad bounce instead of press."""
 TIMED = ("fots", "table32", "raytrace64")
 """Modes that are timed if none is named."""
 ENGINES = ("auto", "mujoco", "mujoco_warp")
@@ -165,12 +167,12 @@ def timed_soft(tactile: ObservationSettings | None, args: Args) -> dict[str, Met
     env = TASKS[args.task][1](args.envs, physics=physics, tactile=tactile, seed=args.seed, device=args.device)
     env.reset(seed=args.seed)
     rng, actions = np.random.default_rng(args.seed), env.single_action_space.shape[0]  # type: ignore[index]
-    rows = []
+    gain, rows = TASKS[args.task][2], []
     for _ in range(args.steps // 3 + args.steps):
         before = dict(env.batch.time_s)
         force = -env.batch.world.state().wrench["sensor"][:, 2]
         action = rng.uniform(-0.1, 0.1, (args.envs, actions))
-        action[:, 2] = np.clip(0.3 * (force - 1.0), -1.0, 1.0)
+        action[:, 2] = np.where(force > 0.0, np.clip(gain * (force - 1.0), -1.0, 1.0), -0.3)
         began = time.perf_counter()
         env.step(action)
         wall, state = time.perf_counter() - began, env.batch.world.state()

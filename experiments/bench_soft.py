@@ -149,6 +149,7 @@ def measured(spec: SensorSpec, levels: tuple[str, ...], refined: bool, presses: 
                 if state is None:
                     break
                 frame = sensor.update(state)
+                np.asarray(frame.rgb)  # waits for it
                 seconds[-1].append(time.perf_counter() - began)
         timed = [float(np.median(press[1:])) for press in seconds[1:] or seconds]
         surface = frame.surface

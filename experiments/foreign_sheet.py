@@ -28,6 +28,8 @@ GRIPPERS = {
 """Example, title of the scene, and titles of the sensors, by the picture's name."""
 VIEWS = {"fetch": (0.34, 140.0, -14.0), "panda": (0.36, 150.0, -12.0), "shadow_hand": (0.27, 60.0, -20.0)}
 """Distance [m], azimuth and elevation [°] of the camera."""
+AMBIENT = {"fetch": 0.25, "panda": 0.45, "shadow_hand": 0.25}
+"""Light from everywhere: robosuite's lamps are over the robot, whose sides would be dark."""
 FINGERS = {"ff": "first", "mf": "middle", "rf": "ring", "lf": "little", "th": "thumb"}
 ENLARGED = {"fetch": 2.0, "panda": 5.0}
 """Factor of the drawn displacements of markers."""
@@ -44,16 +46,16 @@ class Args(CommonOptions):
 
 def draw_scene(axis: Any, world: TactileWorld, name: str, title: str) -> None:
     """Robot and body as MuJoCo draws them, around the pads."""
-    model = world.model  # of which only pictures are made from now on
+    distance, azimuth, elevation = VIEWS[name]
+    camera = SceneCamera(world, resolution=(480, 480), distance=distance, azimuth=azimuth, elevation=elevation)
+    model = camera.model
     model.site_rgba[:, 3] = 0.0
     for geom in map(model.geom, range(model.ngeom)):
         if geom.name.endswith("_collision") or model.body_mocapid[geom.bodyid.item()] >= 0:
             geom.matid[:], geom.rgba[3] = -1, 0.0  # robosuite has another shape to look at; Fetch's mocap body is a green cross
         elif geom.name in ("object0", *(f"{sensor}_case" for sensor in world.sensors)):
             geom.matid[:], geom.rgba[:] = -1, (0.8, 0.15, 0.1, 1.0) if geom.name == "object0" else (0.1, 0.3, 0.7, 1.0)
-    distance, azimuth, elevation = VIEWS[name]
-    camera = SceneCamera(world, resolution=(480, 480), distance=distance, azimuth=azimuth, elevation=elevation)
-    model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.25, 0.25  # the packages' scenes have lights
+    model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = AMBIENT[name], 0.25  # the packages' scenes have lights
     axis.imshow(camera.draw())
     camera.close()
     axis.set_title(title, fontsize=11)
@@ -68,6 +70,8 @@ def loads(state: Any, name: str) -> tuple[float, float]:
 
 def draw_touch(axis: Any, world: TactileWorld, frame: Any, name: str, enlarged: float, device: str) -> None:
     """Ray-traced image of a pad under its markers' displacements."""
+    from matplotlib.patches import Rectangle
+
     sensor = TactileSensor(world.sensors[name].spec, optics="raytrace", outputs=("rgb",), device=device)
     image, markers = sensor.update(frame.surface).rgb[0], frame.markers
     at, by = markers.rest_px[0], markers.displacement_px[0]
@@ -77,12 +81,15 @@ def draw_touch(axis: Any, world: TactileWorld, frame: Any, name: str, enlarged: 
     label = f"{KEY_MM:g} mm (drawn × {enlarged:g})"
     length = enlarged * KEY_MM * px_per_mm
     axis.quiverkey(
-        arrows, 0.04, -0.06, length, label, labelpos="E", color="black", coordinates="axes", fontproperties={"size": 9}
+        arrows, 0.08, -0.06, length, label, labelpos="E", color="black", coordinates="axes", fontproperties={"size": 9}
     )
     down = -world.state().world_from_pad[name][0, 2, :2]  # along the picture
-    start = np.array([45.0, image.shape[0] - 40.0]) - 25.0 * down
-    axis.quiver(*start, *(50 * down), angles="xy", scale_units="xy", scale=1.0, color="white", width=0.012)
-    axis.text(45, image.shape[0] - 6, "gravity", color="white", ha="center", va="bottom", fontsize=9)
+    box = axis.add_patch(Rectangle((8, image.shape[0] - 80), 74, 76, color=(0.0, 0.15, 0.15, 0.85), linewidth=0))
+    start = np.array([45.0, image.shape[0] - 49.0]) - 25.0 * down
+    compass = axis.quiver(*start, *(50 * down), angles="xy", scale_units="xy", scale=1.0, color="white", width=0.012)
+    axis.text(45, image.shape[0] - 7, "gravity", color="white", ha="center", va="bottom", fontsize=9, zorder=5)
+    box.set_zorder(3)  # over the markers' arrows
+    compass.set_zorder(4)
     right, bottom = image.shape[1] - 12.0, image.shape[0] - 12.0
     axis.plot([right - BAR_MM * px_per_mm, right], [bottom, bottom], color="white", linewidth=3)
     axis.text(right - BAR_MM * px_per_mm / 2, bottom - 6, f"{BAR_MM:g} mm", color="white", ha="center", va="bottom", fontsize=9)

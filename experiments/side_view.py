@@ -79,14 +79,22 @@ def _limits(shots: Sequence[Snapshot]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_strip(shots: Sequence[Snapshot], path: Path, count: int = 6) -> None:
-    """Some of the pictures in a row; lengths in mm."""
+    """Some of the pictures in one row, or in two if they are wide; lengths in mm."""
     from matplotlib.figure import Figure
 
     chosen = [shots[i] for i in np.unique(np.linspace(0, len(shots) - 1, count).round().astype(int))]
-    figure = Figure(figsize=(2.6 * len(chosen), 3.2), layout="compressed")
-    for axes, shot in zip(np.atleast_1d(figure.subplots(1, len(chosen), sharey=True)), chosen, strict=True):
+    width, height = np.subtract(*_limits(shots)[::-1])
+    rows = 2 if len(chosen) > 3 and width > 0.8 * height else 1
+    columns = -(-len(chosen) // rows)
+    figure = Figure(figsize=(2.6 * columns, 3.2 * rows), layout="compressed")
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for axes, shot in zip(grid.flat, chosen, strict=False):
         _draw(axes, shot, _limits(shots))
-    figure.axes[0].set_ylabel("z [mm]", fontsize="x-small")
+        axes.label_outer()
+    for axes in grid.flat[len(chosen) :]:
+        axes.set_axis_off()
+    for axes in grid[:, 0]:
+        axes.set_ylabel("z [mm]", fontsize="x-small")
     figure.savefig(path, dpi=110, bbox_inches="tight")
 
 

@@ -177,7 +177,10 @@ def press(size: str) -> Iterator[Callable[[], object]]:
 
 
 def pad(level: str) -> Iterator[Callable[[], object]]:
-    """Steps of the press of ``bench_soft`` with image; nine a round, the first at rest."""
+    """Steps of the press of ``bench_soft`` with its image, which is read: until then it may still be computed.
+
+    Nine a round, the first at rest.
+    """
     from raytac.sensor import TactileSensor
     from raytac.specs import StageSpec, load_press, load_sensor
 
@@ -196,7 +199,7 @@ def pad(level: str) -> Iterator[Callable[[], object]]:
     while True:
         states = loaded.run(8)
         for _ in range(steps_of("pad")):
-            yield lambda states=states: sensor.update(next(states))
+            yield lambda states=states: np.asarray(sensor.update(next(states)).rgb)
 
 
 def frame(name: str) -> Iterator[Callable[[], object]]:

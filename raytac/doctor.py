@@ -209,7 +209,10 @@ PROBES = (
         "CPU: pip install 'raytac[denoise]'; CUDA: the driver's nvoptix.bin in /usr/share/nvidia (containers often lack it)",
         _no_denoiser,
     ),
-    Probe("mujoco", _MUJOCO, True, "pip install 'mujoco>=4.0,<5'"),
+    Probe(
+        "mujoco", _MUJOCO, True,
+        "pip install 'mujoco>=4.0,<5'; where MUJOCO_GL is set, unset it or install what it names (egl: libEGL, osmesa: libOSMesa)",
+    ),
     Probe("exr", _EXR, True, "pip install 'OpenEXR>=3.3,<4'"),
     Probe("assets", _ASSETS, True, "reinstall raytac, or run it from a complete checkout"),
     Probe("figures, meshes", _FIGURES, True, "pip install matplotlib trimesh"),

@@ -44,7 +44,8 @@ PLACES: dict[str, tuple[str, ...]] = {
         "report/test_press_sheet.py",
         "report/test_real.py",
         "report/test_tracers.py",
-        "robots/test_picture.py",  # MuJoCo's own pictures
+        "robots/test_looks.py",  # MuJoCo's own pictures
+        "robots/test_picture.py",
         "specs/test_press_of.py",
         "test_bake_end_to_end.py",
         "test_pad_surface.py",

@@ -40,6 +40,7 @@ class Candidates:
     """Pairs (first, second, body pair) that may come within d̂; counts may exceed what fits.
 
     ``pt_gap``, ``ee_gap``: their distances [m] at positions from which no vertex is farther than ``moved`` [m] (:mod:`ipc.contact.reach`).
+    On a CPU ``pt_near`` and ``ee_near`` list those nearer than ``near`` [m] at these positions, ``near_count`` (2, B) of them.
     """
 
     pt: wp.array2d(dtype=wp.vec3i)
@@ -49,6 +50,10 @@ class Candidates:
     pt_gap: FloatArray2d
     ee_gap: FloatArray2d
     moved: FloatArray
+    near: wp.float64
+    near_count: IntArray2d
+    pt_near: IntArray2d
+    ee_near: IntArray2d
 
 
 @wp.func
@@ -68,17 +73,49 @@ def pair_at(candidates: Candidates, ee: wp.bool, env: wp.int32, i: wp.int32) -> 
 
 
 @wp.func
-def gap_bounds(candidates: Candidates, ee: wp.bool, env: wp.int32, i: wp.int32):
-    """Least and largest distance [m] of candidate i in the motion that was checked last.
+def bounds_of(candidates: Candidates, env: wp.int32, gap: wp.float64):
+    """Least and largest distance [m] of a pair measured at ``gap``, in the motion checked last.
 
     With room for rounding.
     """
-    gap, moved = wp.float64(0.0), wp.float64(2.0 + 1.0e-8) * candidates.moved[env]
+    moved = wp.float64(2.0 + 1.0e-8) * candidates.moved[env]
+    return wp.float64(1.0 - 1.0e-9) * gap - moved, wp.float64(1.0 + 1.0e-9) * gap + moved
+
+
+@wp.func
+def only_near(candidates: Candidates, env: wp.int32, reach: wp.float64) -> wp.bool:
+    """True if the list of near candidates has all that may come within ``reach`` [m]."""
+    least, _most = bounds_of(candidates, env, candidates.near)
+    return candidates.near_count.shape[0] > 0 and least > reach
+
+
+@wp.func
+def listed(candidates: Candidates, ee: wp.bool, env: wp.int32, near: wp.bool) -> wp.int32:
+    """Number of candidates, or of the ``near`` ones."""
+    if near:
+        return candidates.near_count[wp.where(ee, 1, 0), env]
+    return pairs_of(candidates, ee, env)
+
+
+@wp.func
+def listed_at(candidates: Candidates, ee: wp.bool, env: wp.int32, near: wp.bool, k: wp.int32) -> wp.int32:
+    """Candidate k of :func:`listed`."""
+    if near:
+        if ee:
+            return candidates.ee_near[env, k]
+        return candidates.pt_near[env, k]
+    return k
+
+
+@wp.func
+def gap_bounds(candidates: Candidates, ee: wp.bool, env: wp.int32, i: wp.int32):
+    """Least and largest distance [m] of candidate i in the motion that was checked last."""
+    gap = wp.float64(0.0)
     if ee:  # a conditional expression would read both lists, of which one may be shorter
         gap = candidates.ee_gap[env, i] + wp.float64(0.0)
     if not ee:
         gap = candidates.pt_gap[env, i] + wp.float64(0.0)
-    return wp.float64(1.0 - 1.0e-9) * gap - moved, wp.float64(1.0 + 1.0e-9) * gap + moved
+    return bounds_of(candidates, env, gap)
 
 
 @wp.func

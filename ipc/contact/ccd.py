@@ -26,7 +26,7 @@ from __future__ import annotations
 import warp as wp
 
 from ipc.arrays import FloatArray, IntArray, MatArray2d, VecArray2d
-from ipc.broad_phase.lists import Candidates, Surface, gap_bounds, pair_at, pair_vertices, pairs_of
+from ipc.broad_phase.lists import Candidates, Surface, bounds_of, gap_bounds, listed, listed_at, only_near, pair_at, pair_vertices
 from ipc.contact.distance import box_gap, pair_coefficients, separation
 
 wp.set_module_options({"enable_backward": False})
@@ -226,35 +226,45 @@ def ccd_pairs(
     floor: FloatArray,
     reach: FloatArray,
     active: IntArray,
+    threads: wp.int32,
     # outputs
     alpha: FloatArray,
 ):
-    """Lower alpha[env] to what the edge-edge (``ee``) or point-triangle pairs allow."""
-    env, i = wp.tid()
-    if active[env] == 0 or i >= pairs_of(candidates, ee, env):
+    """Lower alpha[env] to what the edge-edge (``ee``) or point-triangle pairs allow.
+
+    By (environment, thread).
+    """
+    env, first = wp.tid()
+    if active[env] == 0:
         return
-    near, most = gap_bounds(candidates, ee, env, i)
-    if near > wp.float64(2.0) * allowed_end(most, slack[env], floor[env], RESOLUTION * reach[env]):
-        return
-    v = pair_vertices(surface, ee, pair_at(candidates, ee, env, i))
-    bound = alpha[env]
-    t = additive_ccd(
-        ee,
-        x[env, v[0]],
-        x[env, v[1]],
-        x[env, v[2]],
-        x[env, v[3]],
-        dx[env, v[0]],
-        dx[env, v[1]],
-        dx[env, v[2]],
-        dx[env, v[3]],
-        slack[env],
-        floor[env],
-        RESOLUTION * reach[env],
-        bound,
-    )
-    if t < bound:
-        wp.atomic_min(alpha, env, t)
+    least = RESOLUTION * reach[env]
+    # What limits no pair measured at the distance ``near`` limits none measured farther apart.
+    _near, most = bounds_of(candidates, env, candidates.near)
+    only = only_near(candidates, env, wp.float64(2.0) * allowed_end(most, slack[env], floor[env], least))
+    for k in range(first, listed(candidates, ee, env, only), threads):
+        i = listed_at(candidates, ee, env, only, k)
+        near, most = gap_bounds(candidates, ee, env, i)
+        if near > wp.float64(2.0) * allowed_end(most, slack[env], floor[env], least):
+            continue
+        v = pair_vertices(surface, ee, pair_at(candidates, ee, env, i))
+        bound = alpha[env] + wp.float64(0.0)
+        t = additive_ccd(
+            ee,
+            x[env, v[0]],
+            x[env, v[1]],
+            x[env, v[2]],
+            x[env, v[3]],
+            dx[env, v[0]],
+            dx[env, v[1]],
+            dx[env, v[2]],
+            dx[env, v[3]],
+            slack[env],
+            floor[env],
+            least,
+            bound,
+        )
+        if t < bound:
+            wp.atomic_min(alpha, env, t)
 
 
 @wp.kernel

@@ -16,7 +16,7 @@ from ipc.bodies.layout import Layout
 from ipc.broad_phase import lists
 from ipc.broad_phase.trees import Trees, trees_pay
 from ipc.contact import ccd, contacts, friction, normal
-from ipc.contact.reach import Reach
+from ipc.contact.reach import NEAR, Reach
 from ipc.reduce import SUM, Reducer
 
 _GROW = 2
@@ -59,12 +59,15 @@ class Collision:
         self._make_boxes(layout)
         self.candidates = lists.Candidates()
         self.candidates.pt_count, self.candidates.ee_count = self._zeros((batch,), wp.int32), self._zeros((batch,), wp.int32)
-        self.candidates.moved = self._zeros((batch,), wp.float64)
+        self.candidates.moved, self.candidates.near = self._zeros((batch,), wp.float64), NEAR * d_hat
+        if not device.is_cuda:
+            self.candidates.near_count = self._zeros((2, batch), wp.int32)
         verts = int(layout.vert_start[-1])
         self._reach = Reach(batch, verts, d_hat, device)
         self._size_candidates(512, 1024)
         self.contacts = contacts.Contacts()
-        self.contacts.count, self.contacts.row_count = self._zeros((batch,), wp.int32), self._zeros((batch,), wp.int32)
+        for name in ("count", "row_count", "open_count"):
+            setattr(self.contacts, name, self._zeros((batch,), wp.int32))
         self._make_friction(layout)
         self._size_contacts(256, 768)
         self.overflow = self._zeros((1,), wp.int32)
@@ -169,6 +172,8 @@ class Collision:
         """Make lists for ``pt`` pairs of point and triangle and ``ee`` pairs of edges, empty."""
         self.candidates.pt, self.candidates.ee = (self._zeros((self.batch, n), wp.vec3i) for n in (pt, ee))
         self.candidates.pt_gap, self.candidates.ee_gap = (self._zeros((self.batch, n), wp.float64) for n in (pt, ee))
+        if not self.device.is_cuda:
+            self.candidates.pt_near, self.candidates.ee_near = (self._zeros((self.batch, n), wp.int32) for n in (pt, ee))
         self._ordered = {n: self._zeros((self.batch, n), wp.vec3i) for n in (pt, ee) if self._sort}
 
     def _size_contacts(self, pairs: int, rows: int) -> None:
@@ -184,6 +189,7 @@ class Collision:
             "row_body": wp.int32,
             "body_row": contacts.mat34d,
             "scaled_row": contacts.mat34d,
+            "open_row": wp.int32,
         }
         self._resize(self.contacts, fields, rows)
         room = pairs if self.friction else 1
@@ -271,27 +277,15 @@ class Collision:
         """Launch a kernel whose threads go over the lists of an environment together."""
         self._launch(kernel, (self.batch, self.lanes), [*inputs, self.lanes], outputs)
 
-    def assemble(
-        self,
-        x: wp.array,
-        start: wp.array,
-        R: wp.array,
-        t: wp.array,
-        kappa: wp.array,
-        friction_eps: float,
-        last: wp.array,
-        active: wp.array,
-        gradient: wp.array,
-        energy: wp.array,
+    def touch(
+        self, x: wp.array, R: wp.array, t: wp.array, kappa: wp.array, active: wp.array, gradient: wp.array, energy: wp.array
     ) -> None:
-        """Contacts at x with their rows of the Hessian; sets ``overflow`` if they do not fit.
+        """Contacts at x with the barrier's rows; sets ``overflow`` if they do not fit.
 
         Args:
-            x, start: vertices now and at the start of the step [m], (B, V).
+            x: vertices [m], (B, V).
             R, t: rotations and positions of frames (B, frames).
             kappa: stiffness of the barrier (B,).
-            friction_eps: ε, the slip at which friction yields [m].
-            last: slip below which rows of friction have the majoriser's curvature alone [m], (B,).
             active: mask (B,).
             gradient, energy: become the gradient (B, V) [N] and the energy of the barrier (B,) [J].
         """
@@ -302,9 +296,22 @@ class Collision:
                 self._each(normal.contact_pairs, [x, self.surface, self.candidates, ee, kappa, active], outputs)
         if self.planes:
             self._each(normal.contact_plane, [x, self.surface, R, t, kappa, active], outputs)
+        self._launch(contacts.check_contacts, self.batch, [self.contacts], [self.overflow])
+
+    def add_friction(
+        self, x: wp.array, start: wp.array, friction_eps: float, last: wp.array, active: wp.array, gradient: wp.array
+    ) -> None:
+        """Add friction's forces and rows to those of :meth:`touch`; may set ``overflow``.
+
+        Args:
+            x, start: vertices now and at the start of the step [m], (B, V).
+            friction_eps: ε, the slip at which friction yields [m].
+            last: slip below which rows of friction have the majoriser's curvature alone [m], (B,).
+            active, gradient: as of :meth:`touch`.
+        """
         if self.friction:
             self._each(friction.friction_rows, [x, start, self.lagged, friction_eps, last, active], [gradient, self.contacts])
-        self._launch(contacts.check_contacts, self.batch, [self.contacts], [self.overflow])
+            self._launch(contacts.check_contacts, self.batch, [self.contacts], [self.overflow])
 
     def energy_change(
         self,
@@ -346,8 +353,9 @@ class Collision:
         """
         if self._meshes:
             for ee, items in ((False, self.candidates.pt), (True, self.candidates.ee)):
-                inputs = [x, dx, self.surface, self.candidates, ee, slack, floor, reach, active]
-                self._launch(ccd.ccd_pairs, items.shape, inputs, [alpha])
+                threads = items.shape[1] if self.device.is_cuda else 1
+                inputs = [x, dx, self.surface, self.candidates, ee, slack, floor, reach, active, threads]
+                self._launch(ccd.ccd_pairs, (self.batch, threads), inputs, [alpha])
         if self.planes:
             inputs = [x, dx, self.surface, *frames0, *frames1, slack, floor, reach, active]
             self._launch(ccd.ccd_plane, (self.batch, self.planes), inputs, [alpha])

@@ -22,6 +22,7 @@ class Contacts:
     ``concave``: 1 where q qᵀ of a row is subtracted, unless the matrix must be definite.
     The same rows over unknowns (``ipc.solver.linear.turn_row``): ``node_row`` at the nodes ``row_nodes``, −1 for none, and ``body_row`` at
     the four nodes of an affine body from ``row_body`` on, −1 for none. ``scaled_row``: work space of a preconditioner.
+    ``open_row``: the ``open_count`` rows that ``ipc.solver.halves.fold_rows`` could not add to blocks of the matrix.
     """
 
     verts: wp.array2d(dtype=wp.vec4i)
@@ -40,6 +41,8 @@ class Contacts:
     row_body: IntArray2d
     body_row: wp.array2d(dtype=mat34d)
     scaled_row: wp.array2d(dtype=mat34d)
+    open_row: IntArray2d
+    open_count: IntArray
 
 
 @wp.func

@@ -24,7 +24,7 @@ from __future__ import annotations
 import warp as wp
 
 from ipc.arrays import FloatArray, IntArray, MatArray2d, VecArray2d
-from ipc.broad_phase.lists import Candidates, Surface, gap_bounds, pair_at, pair_vertices, pairs_of
+from ipc.broad_phase.lists import Candidates, Surface, gap_bounds, listed, listed_at, only_near, pair_at, pair_vertices
 from ipc.contact.barrier import barrier, barrier_first, barrier_second, mollifier, mollifier_first, mollifier_second
 from ipc.contact.contacts import Contacts, push_contact, push_matrix, push_row
 from ipc.contact.distance import box_gap, pair_coefficients, separation
@@ -253,7 +253,9 @@ def contact_pairs(
     env, lane = wp.tid()
     if active[env] == 0:
         return
-    for i in range(lane, pairs_of(candidates, ee, env), lanes):
+    only = only_near(candidates, env, surface.d_hat)
+    for k in range(lane, listed(candidates, ee, env, only), lanes):
+        i = listed_at(candidates, ee, env, only, k)
         near, _most = gap_bounds(candidates, ee, env, i)
         if near >= surface.d_hat:
             continue
@@ -343,7 +345,9 @@ def energy_pairs(
     env, lane = wp.tid()
     if active[env] == 0:
         return
-    for i in range(lane, pairs_of(candidates, ee, env), lanes):
+    only = only_near(candidates, env, surface.d_hat)
+    for k in range(lane, listed(candidates, ee, env, only), lanes):
+        i = listed_at(candidates, ee, env, only, k)
         near, _most = gap_bounds(candidates, ee, env, i)
         if near >= surface.d_hat:
             continue

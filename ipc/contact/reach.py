@@ -23,6 +23,11 @@ wp.set_module_options({"enable_backward": False})
 
 DRIFT = 0.5
 """Displacement of a vertex over d̂ from which distances are measured anew."""
+NEAR = 2.5
+"""Distance over d̂ of the candidates that are listed on a CPU.
+
+The others are not even looked at while vertices have moved little.
+"""
 
 
 @wp.kernel
@@ -77,6 +82,25 @@ def measure_pairs(x: VecArray2d, surface: Surface, ee: wp.bool, far: IntArray, c
         candidates.pt_gap[env, i] = gap
 
 
+@wp.kernel
+def list_near(ee: wp.bool, far: IntArray, candidates: Candidates):
+    """List the near candidates in their order, one thread an environment."""
+    env = wp.tid()
+    if far[env] == 0:
+        return
+    n = wp.int32(0)
+    for i in range(pairs_of(candidates, ee, env)):
+        if ee:
+            if candidates.ee_gap[env, i] < candidates.near:
+                candidates.ee_near[env, n] = i
+                n += 1
+        else:
+            if candidates.pt_gap[env, i] < candidates.near:
+                candidates.pt_near[env, n] = i
+                n += 1
+    candidates.near_count[wp.where(ee, 1, 0), env] = n
+
+
 class Reach:
     """Reference positions of a batch, and when they are taken.
 
@@ -114,6 +138,8 @@ class Reach:
         self._reduce(self._size, self._far, MAX, candidates.moved)
         for ee, pairs in ((False, candidates.pt), (True, candidates.ee)):
             self._launch(measure_pairs, pairs.shape, [x, surface, ee, self._far], [candidates])
+            if not self.device.is_cuda:
+                self._launch(list_near, (self.batch,), [ee, self._far], [candidates])
 
     def _launch(self, kernel: object, dim: tuple[int, ...], inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

@@ -59,8 +59,9 @@ def start_step(friction: wp.int32, d: Decisions, f: Flags):
 def set_flags(d: Decisions, f: Flags):
     """Say whether anything remains to be done; flags were cleared."""
     env = wp.tid()
+    d.touching[env] = wp.max(d.active[env], d.pending[env])
     if f.halt[0] == 0:
-        if d.active[env] != 0 or d.pending[env] != 0:
+        if d.touching[env] != 0:
             f.go[0] = 1
         if d.pending[env] != 0:
             f.pending[0] = 1

@@ -373,6 +373,10 @@ def corner_of(elements: Elements, e: wp.int32, a: wp.int32, F: wp.mat33d, C: wp.
     return Corner(g, F * g, C * g)
 
 
+UNUSED = wp.constant(-(2**31))
+"""Place of a block that is left out."""
+
+
 @wp.func
 def add_block(
     place: wp.int32,
@@ -388,8 +392,10 @@ def add_block(
 ):
     """Add the block of two corners to ``place``.
 
-    A negative one is that of its transpose, less one and with the other sign.
+    A negative one is that of its transpose, less one and with the other sign; ``UNUSED``: nobody reads the block.
     """
+    if place == UNUSED:
+        return
     even, odd = even_part(model, mu, f, p.g, q.g, p.b, q.b, p.c, q.c), odd_part(model, f, F, p.g, q.g)
     if place >= 0:
         blocks[env, place] = blocks[env, place] + volume * (even + odd)
@@ -409,7 +415,8 @@ def add_diagonal(
     blocks: MatArray2d,
 ):
     """The same of one corner."""
-    blocks[env, place] = blocks[env, place] + volume * even_part(model, mu, f, p.g, p.g, p.b, p.b, p.c, p.c)
+    if place != UNUSED:
+        blocks[env, place] = blocks[env, place] + volume * even_part(model, mu, f, p.g, p.g, p.b, p.b, p.c, p.c)
 
 
 @wp.kernel

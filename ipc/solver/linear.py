@@ -35,6 +35,9 @@ class SystemView:
 
     Volume block b has a row q: ``volume_row`` (B, S) at the nodes ``pair_node`` from ``block_pair_start[b]`` on. Node i is in the pairs
     ``node_pair`` from ``node_pair_start[i]`` on. ``volume_motion`` (B, Q) is work space for q·p.
+
+    For the products of :mod:`ipc.solver.halves`, and empty without them, ``above`` are the blocks above the diagonal between unknowns,
+    those of row i from ``above_start[i]`` on (N+1,).
     """
 
     row_base: IntArray
@@ -54,6 +57,8 @@ class SystemView:
     node_pair: IntArray
     volume_row: VecArray2d
     volume_motion: FloatArray2d
+    above_start: IntArray
+    above: IntArray
 
 
 def slice_rows(row_start: NDArray[np.int32], width: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

@@ -57,6 +57,8 @@ class Newton:
         nodes, lanes = len(layout.node_rest), potential.collision.lanes
         self.pcg = Pcg(self.batch, nodes, lanes, self.device)
         self.preconditioner = make_preconditioner(layout, settings, self.batch, lanes, self.device)
+        if not self.device.is_cuda and self.pcg.is_in_one_block(self.preconditioner):
+            potential.use_halves()
         self._still = wp.zeros_like(potential.x)
         self._friction = int(potential.collision.friction)
         self._renewals, self._calm_renewals = (_RENEWALS, 0) if _is_held(layout) else (0, _CALM_RENEWALS)
@@ -230,12 +232,14 @@ class Newton:
         """One Newton iteration of every active environment."""
         pot, state, settings = self.potential, self.state, self.settings
         d, f = state.decisions, state.flags
+        with self._stage("forces"):
+            pot.touch(d.touching)
         if self._friction:
             wp.capture_if(f.pending, self._lag)
         state.launch(decisions.choose_advancing)
         wp.capture_if(f.advance, pot.prescribe, progress=d.trial_progress)
         with self._stage("forces"):
-            pot.assemble(d.active)
+            pot.assemble(d.active, touched=True)
             self._note_extremes(d.active)
         with self._stage("matrix"):
             pot.fill_matrix(d.active)
@@ -259,7 +263,6 @@ class Newton:
         """Friction of the environments that rest, or begin, from their contacts as they are."""
         pot, state = self.potential, self.state
         with self._stage("lag"):
-            pot.touch(state.decisions.pending)
             state.launch(decisions.choose_lagging)
             d = state.decisions
             pot.collision.lag(d.relags, d.lagging, d.changed, d.sum_changed)
@@ -290,6 +293,7 @@ class Newton:
         with self._stage("preconditioner"):
             pot.turn_rows(mask)
             self.preconditioner.update(pot.system, contacts, contacts.row.shape[1], mask)
+            pot.fold_rows(mask)
 
     def _iterate_linear(self, mask: wp.array, tolerance: float) -> None:
         """Improve p by conjugate gradients until a share ``tolerance`` of the residual remains."""

@@ -10,7 +10,7 @@ a CPU, go to :mod:`ipc.solver.pcg_block`.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeGuard
 
 import warp as wp
 
@@ -150,6 +150,10 @@ class Pcg:
         self.scalars.iterations = wp.zeros(batch, dtype=wp.int32, device=device)
         self.scalars.negative = wp.zeros(batch, dtype=wp.int32, device=device)
 
+    def is_in_one_block(self, preconditioner: Preconditioner) -> TypeGuard[BlockJacobi]:
+        """True if :mod:`ipc.solver.pcg_block` solves with this preconditioner."""
+        return isinstance(preconditioner, BlockJacobi) and self.one_block
+
     def solve(
         self,
         system: SystemView,
@@ -172,7 +176,7 @@ class Pcg:
             max_iterations: after these the solution so far stands (it is a descent direction).
             active: mask (B,).
         """
-        if isinstance(preconditioner, BlockJacobi) and self.one_block:
+        if self.is_in_one_block(preconditioner):
             threads = THREADS if self.device.is_cuda else 1
             inputs = [
                 *(system, contacts, preconditioner.inverse, preconditioner.elimination, tolerance, max_iterations),

@@ -19,6 +19,7 @@ from ipc.contact.collision import Collision
 from ipc.reduce import BLOCK, MAX, MIN, SUM, Reducer
 from ipc.settings import Settings
 from ipc.solver import dilation, dynamics, elasticity, frames
+from ipc.solver.halves import fold_rows
 from ipc.solver.linear import SystemView, find_volume_motions, push_blocks, push_rows, slice_rows, turn_rows
 
 _SLICE = 32
@@ -136,6 +137,7 @@ class Potential:
         self.system.blocks = matrices(len(columns))
         self.system.R = self.R
         self.system.project = self.project
+        self.mirrors = True
 
     def launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list | None = None) -> None:
         """Launch a kernel on the device of the batch."""
@@ -211,17 +213,24 @@ class Potential:
         self.launch(elasticity.element_state, self.el_J.shape, inputs, outputs)
 
     def touch(self, active: wp.array) -> None:
-        """Contacts, their forces and rows at x."""
-        placed = self.R, self.t
-        outputs = self.vert_gradient, self.barrier
-        self.collision.assemble(self.x, self.x_start, *placed, self.kappa, self.friction_eps, self.last, active, *outputs)
+        """Contacts at x, with forces and rows of the barrier."""
+        self.collision.touch(self.x, self.R, self.t, self.kappa, active, self.vert_gradient, self.barrier)
 
-    def assemble(self, active: wp.array) -> None:
-        """Forces, contacts and energies at y; ``residual`` is −``gradient`` on the unknowns."""
+    def add_friction(self, active: wp.array) -> None:
+        """Friction's forces and rows, once after each :meth:`touch`."""
+        self.collision.add_friction(self.x, self.x_start, self.friction_eps, self.last, active, self.vert_gradient)
+
+    def assemble(self, active: wp.array, *, touched: bool = False) -> None:
+        """Forces, contacts and energies at y; ``residual`` is −``gradient`` on the unknowns.
+
+        ``touched``: :meth:`touch` was called at this y.
+        """
         self.evaluate_elements(active)
         inputs = [self.corner_start, self.corner, self.elements, self.el_P, active]
         self.launch(elasticity.node_elastic_gradient, self.y.shape, inputs, [self.gradient])
-        self.touch(active)
+        if not touched:
+            self.touch(active)
+        self.add_friction(active)
         if len(self.summed_nodes):
             threads = BLOCK if self.device.is_cuda else 1
             inputs, outputs = [self.vert_gradient, self.verts, self.summed_nodes, active, threads], [self.summed_gradient]
@@ -246,7 +255,8 @@ class Potential:
             self.launch(elasticity.fill_inertia, dim, [self.upper, self.masses, self.dt, active], [blocks])
             inputs = [self.places, self.elements, self.el_F, self.el_mckl, active]
             self.launch(elasticity.add_element_blocks, self.el_J.shape, inputs, [blocks])
-            self.launch(elasticity.mirror_blocks, dim, [self.upper, active], [blocks])
+            if self.mirrors:
+                self.launch(elasticity.mirror_blocks, dim, [self.upper, active], [blocks])
         if self.volume_blocks:
             inputs, row = [self.elements, self.volumes, self.el_F, active], self.system.volume_row
             self.launch(dilation.dilation_rows, row.shape, inputs, [row])
@@ -255,6 +265,32 @@ class Potential:
         """Write the contact rows of :meth:`touch` over the unknowns."""
         lanes = self.collision.lanes
         self.launch(turn_rows, (self.batch, lanes), [self.system, self.collision.contacts, active, lanes])
+
+    def use_halves(self) -> None:
+        """Let products take the blocks above the diagonal twice (:mod:`ipc.solver.halves`).
+
+        Contact rows are added to the blocks then, and blocks that nobody reads are left out.
+        """
+        layout, where = self.layout, self.where
+        rows = np.repeat(np.arange(len(layout.node_rest), dtype=np.int64), np.diff(layout.row_start))
+        unknown = (layout.node_free[rows] != 0) & (layout.node_free[layout.col] != 0)
+        above = np.flatnonzero(unknown & (layout.col > rows))
+        starts = np.concatenate([[0], np.cumsum(np.bincount(rows[above], minlength=len(layout.node_rest)))])
+        self.system.above, self.system.above_start = (
+            wp.array(values, dtype=wp.int32, device=self.device) for values in (where[above], starts)
+        )
+        # Gripped nodes push the unknowns with whole rows, and affine bodies are eliminated by whole blocks.
+        self.mirrors = self.grips > 0 or bool((layout.vert_count > 1).any())
+        if not self.mirrors:
+            upper = self.upper.numpy()
+            self.upper = wp.array(upper[unknown[upper[:, 0]]], dtype=wp.int32, device=self.device)
+            places = _element_places(layout, rows, where, unknown)
+            self.places = wp.array(places, dtype=wp.int32, device=self.device)
+
+    def fold_rows(self, active: wp.array) -> None:
+        """Add the rows of :meth:`turn_rows` to the blocks, if halves are used."""
+        if self.system.above_start is not None:
+            self.launch(fold_rows, (self.batch,), [self.system, self.collision.contacts, active])
 
     def try_step(self, alpha: wp.array) -> None:
         """y1 = y + alpha p and its vertices, in the frames as they are."""
@@ -313,16 +349,18 @@ class Potential:
         self.reduce(self.node_change, self.everyone, SUM, self.kinetic)
 
 
-def _element_places(layout: Layout, rows: np.ndarray, where: np.ndarray) -> np.ndarray:
+def _element_places(layout: Layout, rows: np.ndarray, where: np.ndarray, used: np.ndarray | None = None) -> np.ndarray:
     """Places (E, 10) of the elements' blocks as in ``elasticity.add_element_blocks``.
 
     Args:
         rows: row of each block of the matrix (K,).
         where: place of each block (K,).
+        used: False for blocks that are left out (K,); None for none.
     """
     blocks = np.empty(16 * len(layout.tets), np.int64)
     blocks[layout.part] = np.repeat(np.arange(len(layout.col)), np.diff(layout.part_start))
     blocks = blocks.reshape(-1, 16)
     ab = np.array(elasticity.PAIRS)
     straight, turned = blocks[:, ab], blocks[:, 4 * (ab % 4) + ab // 4]
-    return np.where(rows[straight] <= layout.col[straight], where[straight], -1 - where[turned])
+    places = np.where(rows[straight] <= layout.col[straight], where[straight], -1 - where[turned])
+    return places if used is None else np.where(used[straight], places, elasticity.UNUSED)

@@ -22,6 +22,7 @@ class Decisions:
     alive: IntArray  # takes part in this step
     active: IntArray  # is being minimised
     pending: IntArray  # came to rest, or begins: its friction is to be lagged
+    touching: IntArray  # is either: its contacts are wanted
     lagging: IntArray  # its friction is lagged now
     advancing: IntArray  # its frames advance in this iteration
     plain: IntArray  # takes an ordinary Newton step in this iteration

@@ -23,6 +23,8 @@ from raytac.calibrate.light_parameters import (
     DARKEST,
     HEIGHT,
     LENGTH,
+    MOST_MIXED,
+    OFF_DIAGONAL,
     REFERENCE_DISTANCE,
     LightParameters,
     darkest,
@@ -45,6 +47,7 @@ SIGMA = {
     "gamma": 0.5,
     "stray": 0.5,
     "vignette": 0.5,
+    "mix": 0.1,
     "slope": 0.15,
 }
 """Standard deviation of a parameter about its start [mm, rad, 1].
@@ -215,7 +218,7 @@ class DirectFit:
     def blocks(self, p: LightParameters) -> list[tuple[str, int]]:
         """Name (of ``SIGMA``) of every parameter of the vector's blocks, and how many follow."""
         per_led = [("place", 3), ("aim", 2), ("lobe", 1), ("height", 1), ("length", 1)] * len(p.leds)
-        rest = [("glow", 3), ("gamma", 1), ("stray", 3), ("vignette", 2), ("slope", len(self.start.slopes))]
+        rest = [("glow", 3), ("gamma", 1), ("stray", 3), ("vignette", 2), ("mix", 6), ("slope", len(self.start.slopes))]
         return [*per_led, ("power", p.power.size), *rest]
 
     def sigma(self, p: LightParameters) -> np.ndarray:
@@ -242,15 +245,14 @@ class DirectFit:
 
     def flat(self, state: FitState) -> np.ndarray:
         p = state.p
-        return np.concatenate([p.leds.ravel(), p.power.ravel(), p.glow, p.response, state.slopes])
+        return np.concatenate([p.leds.ravel(), p.power.ravel(), p.glow, p.response, p.mix, state.slopes])
 
     def at(self, x: np.ndarray, circles: np.ndarray) -> FitState:
         p = self.start.p
-        cuts = np.cumsum([p.leds.size, p.power.size, 3, 6])
-        leds, power, glow, response, slopes = np.split(x, cuts)
-        changed = dataclasses.replace(
-            p, leds=leds.reshape(p.leds.shape), power=power.reshape(-1, 3), glow=glow, response=response
-        )
+        cuts = np.cumsum([p.leds.size, p.power.size, 3, 6, 6])
+        leds, power, glow, response, mix, slopes = np.split(x, cuts)
+        leds, power = leds.reshape(p.leds.shape), power.reshape(-1, 3)
+        changed = dataclasses.replace(p, leds=leds, power=power, glow=glow, response=response, mix=mix)
         return FitState(changed, slopes, circles)
 
     def inside_bounds(self, state: FitState) -> FitState:
@@ -261,7 +263,8 @@ class DirectFit:
         response[0], response[1:4] = np.clip(response[0], 1.0, 2.4), np.clip(response[1:4], 0, DARKEST)
         a1 = np.clip(response[4], -2.0, 0.5)
         response[4], response[5] = a1, np.clip(response[5], max(-0.3, -0.75 - a1), 1.5)
-        changed = dataclasses.replace(p, leds=leds, power=np.maximum(p.power, 0), glow=np.maximum(p.glow, 0), response=response)
+        power, glow, mix = np.maximum(p.power, 0), np.maximum(p.glow, 0), np.clip(p.mix, MOST_MIXED, 0)
+        changed = dataclasses.replace(p, leds=leds, power=power, glow=glow, response=response, mix=mix)
         circles = state.circles.copy()
         circles[:, 2] = np.clip(circles[:, 2], 3, None)
         return FitState(changed, state.slopes, circles)
@@ -301,10 +304,12 @@ class DirectFit:
         gains = self._gains(p, image, rest, total)
         (count, wide), slopes = p.leds.shape, len(state.slopes)
         first = p.leds.size + p.power.size
-        jac = np.zeros((first + 9 + slopes, image.size), np.float32)
+        mixing, unmixed = p.mixing.T, [_powered(p, part) for part in whole.parts]
+        jac = np.zeros((first + 15 + slopes, image.size), np.float32)
         rest_jac = np.zeros((len(jac), rest.size), np.float32)
 
-        def column(k: int, pressed: np.ndarray, flat: np.ndarray, still: np.ndarray) -> None:
+        def column(k: int, *parts: np.ndarray, mixing: np.ndarray = mixing) -> None:
+            pressed, flat, still = (part @ mixing for part in parts)
             jac[k] = (gains[0] * pressed - gains[1] * flat).ravel()
             rest_jac[k] = (gains[2] * still).ravel()
 
@@ -325,7 +330,9 @@ class DirectFit:
             other, other_rest = self.images(dataclasses.replace(p, response=response), total)
             jac[first + 3 + k] = ((other - image) / STEP).ravel()
             rest_jac[first + 3 + k] = ((other_rest - rest) / STEP).ravel()
-        by_point, by_normal = self._by_geometry(p, leds[0])
+        for k, (row, other) in enumerate(np.argwhere(OFF_DIAGONAL)):
+            column(first + 9 + k, *unmixed, mixing=np.outer(np.eye(3)[other], np.eye(3)[row]))
+        by_point, by_normal = (part @ mixing for part in self._by_geometry(p, leds[0]))
 
         def moved(slopes: np.ndarray, circles: np.ndarray, step: float) -> np.ndarray:
             new = self.geometry(FitState(p, slopes, circles))
@@ -333,7 +340,7 @@ class DirectFit:
             return (gains[0] * change / step).ravel()
 
         for k in range(slopes):
-            jac[first + 9 + k] = moved(state.slopes + STEP * np.eye(slopes)[k], state.circles, STEP)
+            jac[first + 15 + k] = moved(state.slopes + STEP * np.eye(slopes)[k], state.circles, STEP)
         circles = np.zeros((image.size, 3), np.float32)
         if self.settings.circles:
             for k in range(3):
@@ -475,5 +482,10 @@ def _draw(rho: np.ndarray, settings: FitSettings, seed: int) -> tuple[np.ndarray
 
 
 def _summed(p: LightParameters, light: Light) -> list[np.ndarray]:
-    """All LEDs at their powers, (M, 3) of each part of ``light``."""
-    return [np.maximum(np.einsum("lmc,lc->mc", part, p.power), 1e-6) for part in light.parts]
+    """All LEDs at their powers, mixed by the colour matrix, (M, 3) of each part of ``light``."""
+    return [np.maximum(_powered(p, part) @ p.mixing.T, 1e-6) for part in light.parts]
+
+
+def _powered(p: LightParameters, part: np.ndarray) -> np.ndarray:
+    """All LEDs at their powers, (M, 3) of a part of light (L, M, 3)."""
+    return np.einsum("lmc,lc->mc", part, p.power)

@@ -261,7 +261,8 @@ def with_shading(
     bare = sensor.response.unshaded
     plain = dataclasses.replace(sensor, response=bare)
     tracer = (tracing or RayTraced()).build(plain, resolution=(width, height), outputs=("layers",), device=device)
-    rest = total(tracer.render_layers(GelSurface.at_rest(make_grid(sensor.gelpad, settings.pitch))))[0] * tracer.response.scale
+    layers = tracer.render_layers(GelSurface.at_rest(make_grid(sensor.gelpad, settings.pitch)))
+    rest = tracer.response.mixed(total(layers)[0]) * tracer.response.scale
     if not (rest > 0).all():
         rule = "leave this many values of the image at rest dark, and no gain makes these bright"
         raise InputError("lights", value=int((rest <= 0).sum()), rule=rule)

@@ -36,6 +36,10 @@ SHORTEST = 0.1
 """Least of a fitted length [mm]; the most is what the case takes."""
 GAP = 0.02
 """Distance [mm] that an LED's corners keep from the case and the gel."""
+MOST_MIXED = -0.5
+"""Least number of a fitted colour matrix off its diagonal (a guess); the most is 0.
+Light of several channels from one LED is in its powers."""
+OFF_DIAGONAL = ~np.eye(3, dtype=bool)
 REFERENCE_DISTANCE = 10e-3
 """Distance [m] at which a power of 1 gives a coat facing the LED full scale."""
 
@@ -55,6 +59,8 @@ class LightParameters:
     response: np.ndarray
     """(6,): gamma, stray light of each channel, a₁ and a₂ of the vignette 1 + a₁r² + a₂r⁴.
     Stray light is over that of the channel's darkest background pixel."""
+    mix: np.ndarray
+    """(6,): the colour matrix off its diagonal, row by row, for light in full scales."""
 
     @classmethod
     def of(cls, sensor: SensorSpec, background: np.ndarray) -> LightParameters:
@@ -72,7 +78,15 @@ class LightParameters:
         stray = np.clip(np.array(response.black_level) / darkest(background, response.gamma), 0, DARKEST)
         glow = [max((led.glow for led in sensor.lights.leds if led.layer == c), default=0.0) * _GLOW for c in CHANNELS]
         a1, a2, _ = response.vignetting
-        return cls(sensor.lights, np.array(leds), np.array(power), np.array(glow), np.array([response.gamma, *stray, a1, a2]))
+        at_response, mix = np.array([response.gamma, *stray, a1, a2]), np.array(response.colour_mix) * _mixed_balance(sensor)
+        return cls(sensor.lights, np.array(leds), np.array(power), np.array(glow), at_response, mix)
+
+    @property
+    def mixing(self) -> np.ndarray:
+        """The colour matrix for light in full scales, (3, 3)."""
+        whole = np.eye(3)
+        whole[OFF_DIAGONAL] = self.mix
+        return whole
 
     @property
     def layer(self) -> np.ndarray:
@@ -131,6 +145,12 @@ def full_scale(sensor: SensorSpec) -> np.ndarray:
     return response.gain * np.array(response.white_balance) * diffuse / REFERENCE_DISTANCE**2
 
 
+def _mixed_balance(sensor: SensorSpec) -> np.ndarray:
+    """White balance of a channel over that of the channel it takes from, (6,) as ``colour_mix``."""
+    balance = np.array(sensor.response.white_balance)
+    return (balance[:, None] / balance)[OFF_DIAGONAL]
+
+
 def mean_power(p: LightParameters) -> float:
     """Mean over LEDs of their power in the channel that they light most [full scales]."""
     return max(float(p.power.max(1).mean()), 1e-6)
@@ -141,7 +161,11 @@ def with_parameters(sensor: SensorSpec, p: LightParameters, background: np.ndarr
     gamma, *stray, a1, a2 = map(float, p.response)
     black = np.array(stray) * darkest(background, gamma)
     black_level = tuple(map(float, black))
-    response = dataclasses.replace(sensor.response.unshaded, gamma=gamma, black_level=black_level, vignetting=(a1, a2, 0.0))
+    mix = tuple(map(float, p.mix / _mixed_balance(sensor)))
+    vignetting = (a1, a2, 0.0)
+    response = dataclasses.replace(
+        sensor.response.unshaded, gamma=gamma, black_level=black_level, vignetting=vignetting, colour_mix=mix
+    )
     return dataclasses.replace(sensor, response=response, lights=p.lights(sensor))
 
 

@@ -64,7 +64,7 @@ class Fitted:
 
 def brightened(problem: DirectFit, state: FitState) -> FitState:
     """The same with powers that give the image at rest its mean in every channel."""
-    rest = np.einsum("lmc,lc->mc", problem.light(state.p, problem.geometry(state)).rest, state.p.power).mean(0)
+    rest = problem.total(state.p, problem.light(state.p, problem.geometry(state)))[2].mean(0)
     gain = decode(problem.rest_real, state.p.response[0]).mean(0) / np.maximum(rest, 1e-9)
     return dataclasses.replace(state, p=dataclasses.replace(state.p, power=state.p.power * gain))
 

@@ -10,6 +10,7 @@ from raytac.calibrate.light_parameters import CHANNELS
 from raytac.checks import check_whole
 from raytac.errors import InputError
 from raytac.specs import LedSpec, LightsSpec, SensorSpec
+from raytac.specs.sensor import UNMIXED
 from raytac.specs.sensor_check import led_corners, validate_sensor
 
 GAMMA, VIGNETTE = 1.4, -0.1
@@ -27,9 +28,11 @@ SPREAD = 1.5
 def with_first_response(sensor: SensorSpec) -> SensorSpec:
     """The sensor with the response that a fit begins from, whatever its file was fitted to.
 
-    Gamma ``GAMMA``, no stray light, the vignette 1 + ``VIGNETTE`` r², no colour shading; exposure and white balance are the sensor's.
+    Gamma ``GAMMA``, no stray light, the vignette 1 + ``VIGNETTE`` r², no shading or mix; exposure and white balance are the sensor's.
     """
-    plain = replace(sensor.response.unshaded, gamma=GAMMA, black_level=(0.0, 0.0, 0.0), vignetting=(VIGNETTE, 0.0, 0.0))
+    vignetting = (VIGNETTE, 0.0, 0.0)
+    bare = replace(sensor.response.unshaded, black_level=(0.0, 0.0, 0.0), colour_mix=UNMIXED)
+    plain = replace(bare, gamma=GAMMA, vignetting=vignetting)
     return replace(sensor, response=plain)
 
 

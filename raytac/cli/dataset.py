@@ -38,7 +38,8 @@ class DatasetArgs(SolverOptions):
     """Press objects many times and keep what the sensor sees: a sharded data set.
 
     On this machine or on a Ray cluster. What is given here goes before what the sweep's file says. Without --out the folder is
-    runs/dataset. Killed at any time, the same command goes on where it stopped. Needs raytac[dataset], with --engine ray raytac[ray].
+    runs/dataset. Killed at any time, the same command goes on where it stopped; with a greater --count it adds to a data set. Needs
+    raytac[dataset], with --engine ray raytac[ray].
     """
 
     sweep: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="SWEEP")] = None

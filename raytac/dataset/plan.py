@@ -130,7 +130,11 @@ class DatasetPlan:
         first = shard * self.sweep.shard_size
         if not 0 <= shard < self.shards:
             raise InputError("shard", value=shard, rule=f"must be in [0, {self.shards})")
-        return self.draw(np.arange(first, min(first + self.sweep.shard_size, self.sweep.count)))
+        return self.draw(np.arange(first, first + self.shard_presses(shard)))
+
+    def shard_presses(self, shard: int) -> int:
+        """Number of presses of a shard; the last one may have fewer."""
+        return min(self.sweep.shard_size, self.sweep.count - shard * self.sweep.shard_size)
 
     def draw(self, index: np.ndarray) -> Presses:
         """Presses by their numbers."""
@@ -214,8 +218,7 @@ class DatasetPlan:
     def shard_bytes(self, shard: int) -> int:
         """Bytes on disk of a shard, not compressed, but for some kilobytes of headers and rows."""
         sensor = self.sweep.sensors[self.variant(shard)[0]]
-        count = min(self.sweep.shard_size, self.sweep.count - shard * self.sweep.shard_size)
-        return count * self.press_bytes(sensor) + self._shared_bytes(sensor)
+        return self.shard_presses(shard) * self.press_bytes(sensor) + self._shared_bytes(sensor)
 
     def total_bytes(self, without: Collection[int] = ()) -> int:
         """Bytes on disk of all shards but those ``without``, not compressed.

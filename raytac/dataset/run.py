@@ -70,7 +70,8 @@ def render_dataset(
     """Render the shards that ``folder`` lacks, and write manifest and description.
 
     Shards that are there are read and compared with their checksums; those that are whole stay. A run that is killed leaves whole
-    shards only, and the same call goes on with the others.
+    shards only, and the same call goes on with the others. A plan that differs only in a greater number of presses adds to the folder;
+    a last shard that was not full is rendered again.
 
     Args:
         folder: of the data set; made if need be.
@@ -94,11 +95,14 @@ def render_dataset(
     folder = Path(folder)
     with FolderLock(folder):
         store = ShardStore(folder, plan.digest, compress=compress)
-        _check_same(folder, plan, store)
+        store.shorter = _check_same(folder, plan, store)
         with _write_errors(folder):
             store.clear_partial()
-        records = _whole(store, progress, say)
+        records = _whole(plan, store, progress, say)
         _check_room(folder, plan, records, say)
+        if store.shorter is not None:
+            with _write_errors(folder):
+                _lengthen(folder, plan, store, records)
         missing = [shard for shard in range(plan.shards) if shard not in records]
         job = RenderJob(plan, device, batch)
         start, done, first = time.perf_counter(), 0, None
@@ -143,38 +147,60 @@ def verify_dataset(folder: Path, *, progress: bool = False) -> Check:
     return Check(description["shards"], wrong)
 
 
-def _whole(store: ShardStore, progress: bool, say: Callable[[str], object]) -> dict[int, ShardRecord]:
+def _whole(plan: DatasetPlan, store: ShardStore, progress: bool, say: Callable[[str], object]) -> dict[int, ShardRecord]:
     """Records of the shards that are there and whole."""
     records = {}
     for shard in Progress(store.present(), desc="check", unit="shard", show=progress, leave=False):
         record = store.read(shard)
-        if isinstance(record, ShardRecord):
-            records[shard] = record
-        else:
+        if isinstance(record, str):
             say(f"{record}: rendered again")
+        elif len(record.rows) < plan.shard_presses(shard):  # the last one of fewer presses
+            say(f"{shard:06d} has {len(record.rows)} of {plan.shard_presses(shard)} presses: rendered again")
+        else:
+            records[shard] = record
     return records
+
+
+def _lengthen(folder: Path, plan: DatasetPlan, store: ShardStore, records: dict[int, ShardRecord]) -> None:
+    """Let the whole shards of fewer presses be of this plan, and then say so in the description.
+
+    In this order a run that is killed between both goes on: shards of either plan are read.
+    """
+    for record in records.values():
+        store.stamp(record)
+    write_description(folder, describe(plan, _ordered(records), None))
+    store.shorter = None
 
 
 def _ordered(records: dict[int, ShardRecord]) -> list[ShardRecord]:
     return [records[shard] for shard in sorted(records)]
 
 
-def _check_same(folder: Path, plan: DatasetPlan, store: ShardStore) -> None:
-    """Refuse a folder with shards of another plan; a description alone is of an empty run."""
+def _check_same(folder: Path, plan: DatasetPlan, store: ShardStore) -> str | None:
+    """Refuse a folder with shards of another plan; a description alone is of an empty run.
+
+    Returns the digest of the folder's plan if it differs only in fewer presses.
+    """
     shards = folder / FOLDER
     if os.path.lexists(shards) and not shards.is_dir():
         raise InputError("out", value=shards, rule="must be a folder, or not exist")
     if not shards.is_dir() or not any(shards.iterdir()):
-        return
+        return None
     if not (folder / FILE).is_file():
         raise InputError("out", value=folder, rule=f"holds shards without a {FILE}: choose another folder")
     description = read_description(folder)
-    if description["plan_sha256"] != plan.digest:
-        old, new = description["plan"], plan.description
-        changed = [key for key in {**old, **new} if json.dumps(old.get(key)) != json.dumps(new.get(key))]
-        differs = ", ".join(changed) or "its version"
-        rule = f"holds another data set, which differs in {differs}: choose another folder, or remove it"
+    if description["plan_sha256"] == plan.digest:
+        return None
+    old, new = description["plan"], plan.description
+    changed = [key for key in {**old, **new} if json.dumps(old.get(key)) != json.dumps(new.get(key))]
+    if changed == ["count"] and type(old.get("count")) is int:
+        if old["count"] < new["count"]:
+            return description["plan_sha256"]
+        rule = f"holds {old['count']} presses, more than the {new['count']} asked for: choose another folder, or remove it"
         raise InputError("out", value=folder, rule=rule)
+    differs = ", ".join(changed) or "its version"
+    rule = f"holds another data set, which differs in {differs}: choose another folder, or remove it"
+    raise InputError("out", value=folder, rule=rule)
 
 
 def _check_room(folder: Path, plan: DatasetPlan, records: dict[int, ShardRecord], say: Callable[[str], object]) -> None:

@@ -44,6 +44,8 @@ class ShardStore:
     def __init__(self, folder: Path, plan_sha256: str, *, compress: bool = False) -> None:
         """``plan_sha256``: of the plan that shards must be of; ``compress``: deflate new ones."""
         self.folder, self._plan, self._compress = Path(folder), plan_sha256, compress
+        self.shorter: str | None = None
+        """Digest of a plan of fewer presses, whose shards are read too."""
 
     def write(self, result: ShardResult) -> ShardRecord:
         """Keep a shard; its ``.json`` comes last, so that an interrupt leaves none half finished."""
@@ -57,10 +59,14 @@ class ShardStore:
             arrays.unlink(missing_ok=True)
         sha256 = hashlib.sha256(data).hexdigest() if data else ""
         record = ShardRecord(result.shard, file, sha256, len(data), result.rows, result.made_by)
+        self.stamp(record)
+        return record
+
+    def stamp(self, record: ShardRecord) -> None:
+        """Write the ``.json`` of a shard, which says that it is of this plan."""
         kept = {"plan_sha256": self._plan, **{name: getattr(record, name) for name in ("file", "sha256", "bytes", "made_by")}}
         kept |= {"rows_sha256": _rows_digest(record.rows), "rows": record.rows}
-        write_atomic(self._path(result.shard, "json"), (json.dumps(kept, allow_nan=False) + "\n").encode())
-        return record
+        write_atomic(self._path(record.shard, "json"), (json.dumps(kept, allow_nan=False) + "\n").encode())
 
     def read(self, shard: int) -> ShardRecord | str:
         """The record of a whole shard; else a text that says what is wrong, or ``missing``."""
@@ -68,7 +74,7 @@ class ShardStore:
         try:
             kept = json.loads(read_regular(path))
             record = ShardRecord(shard, kept["file"], kept["sha256"], kept["bytes"], kept["rows"], kept["made_by"])
-            if kept["plan_sha256"] != self._plan:
+            if kept["plan_sha256"] not in (self._plan, self.shorter):
                 return f"{path.name} is of another plan"
             if kept["rows_sha256"] != _rows_digest(record.rows):
                 return f"{path.name} differs from its checksum"

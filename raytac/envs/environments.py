@@ -259,11 +259,13 @@ class EnvironmentPicture:
         self._batch, self._height = batch, height
         self._rest: dict[str, np.ndarray] = {}
         """Images at rest by sensor, which differences are from."""
-        # Near enough to see a pad of two centimetres, far enough that tool and body, a long pole too, stay in view.
+        # Near enough to see a pad of two centimetres, far enough that tool and body, a long pole too, stay in view; over a tool that
+        # looks down there is room for the hand. From this side both fingers of a gripper are seen, and what is between them.
         tool, body = batch.start_tool[:3, 3], batch.start_body[:3, 3]
-        distance = 0.45 + 1.5 * float(np.linalg.norm(tool - body))
+        distance = 0.5 + 1.5 * float(np.linalg.norm(tool - body))
+        middle = 0.5 * (tool + body) + np.array([0.0, 0.0, 0.05 * max(0.0, -float(batch.start_tool[2, 2]))])
         self._camera = SceneCamera(
-            batch.world, resolution=(4 * height // 3, height), distance=distance, lookat=0.5 * (tool + body)
+            batch.world, resolution=(4 * height // 3, height), distance=distance, azimuth=150.0, lookat=middle
         )
 
     def draw(self, env: int, observation: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -152,6 +152,7 @@ class DeviceMode(ABC):
             if grid is not self._grid and not all(np.array_equal(getattr(grid, k), getattr(self._grid, k)) for k in names):
                 rule = f"one optical mode renders one grid and rest surface, the first that it was given, {self._grid.shape} here"
                 raise InputError("surface.grid", value=grid.shape, rule=rule)
+            self._grid = grid  # an equal one of another pad: known at sight from now on
             return
         check_view(self.camera, grid)
         self.layout = CoatLayout.from_grid(grid)

@@ -21,9 +21,9 @@ _STEPS = 60
 
 
 class Response:
-    """u8 = 255 · clip(white balance · exposure · vignette · shading · L + black)^(1/γ), rounded.
+    """u8 = 255 · clip(wb · exposure · vignette · shading · M L + black)^(1/γ), rounded.
 
-    With ``monochrome`` what is clipped is the mean over channels, and all three show it.
+    M is the colour matrix, wb the white balance. With ``monochrome`` what is clipped is the mean over channels, and all three show it.
     """
 
     def __init__(self, spec: ResponseSpec, camera: Pinhole, *, monochrome: bool = False) -> None:
@@ -37,9 +37,12 @@ class Response:
         self.scale = (even * shading_gain(spec.shading, camera.resolution)).astype(np.float32)
         """Linear gain per pixel and channel, (H, W, 3); a flat field multiplies it."""
         self.black = np.asarray(spec.black_level, dtype=np.float32)
+        self.matrix = np.array(spec.colour_matrix, np.float32)
+        self._mixes = bool((self.matrix != np.eye(3)).any())
 
     def set_flat_field(self, background: np.ndarray, at_rest: np.ndarray) -> None:
         """Turn radiance ``at_rest`` (H, W, 3) into ``background`` (uint8); InputError where dark."""
+        at_rest = self.mixed(at_rest)
         dark = int((at_rest <= 0).sum())
         if dark:
             rule = f"{dark} of {at_rest.size} values rendered at rest are dark, so no gain makes them bright"
@@ -50,8 +53,14 @@ class Response:
             return
         self.scale = (target / at_rest).astype(np.float32)
 
+    def mixed(self, linear: np.ndarray) -> np.ndarray:
+        """Radiance (…, 3) after the colour matrix."""
+        return linear @ self.matrix.T if self._mixes else linear
+
     def encode(self, mi: Any, linear: list[Any], scale: list[Any]) -> Any:
         """8-bit RGB (N·3) of three device arrays (B·H·W) of radiances; ``scale``: ``device_scale``."""
+        if self._mixes:
+            linear = [sum((float(m) * light for m, light in zip(row, linear, strict=True)), mi.Float(0)) for row in self.matrix]
         n = dr.width(linear[0])
         i = dr.arange(mi.UInt32, n)
         pixel = i % dr.width(scale[0])
@@ -70,7 +79,7 @@ class Response:
 
     def encode_numpy(self, linear: np.ndarray) -> np.ndarray:
         """8-bit image (…, H, W, 3) of linear radiance of that shape."""
-        value = linear * self.scale + self.black
+        value = self.mixed(linear) * self.scale + self.black
         if self.monochrome:
             value = np.broadcast_to(_grey(value), value.shape)
         return (np.clip(value, 0, 1) ** (1 / self.spec.gamma) * 255 + 0.5).astype(np.uint8)

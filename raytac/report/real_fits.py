@@ -65,6 +65,7 @@ ABLATIONS: dict[str, Ablation] = {
     "no_response_curve": Ablation(
         sensor=lambda s: replace(s, response=replace(s.response, gamma=1.0, black_level=(0.0, 0.0, 0.0))), fixed=("stray",)
     ),
+    "no_colour_matrix": Ablation(fixed=("mix",)),
     "one_led_a_colour": Ablation(sensor=_one_a_colour),
     "rigid_pad_imprint": HELD,
     "one_photograph_at_rest": Ablation(settle=False),

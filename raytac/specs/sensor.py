@@ -22,6 +22,7 @@ from raytac.specs.toml import ANY, Flag, Integer, Number, Schema, Text, check_fi
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 
+UNMIXED: Final = (0.0,) * 6
 AUTO: Final = "auto"
 """In place of an exposure: that which makes the image at rest mid-grey."""
 BONDED = ("back", "back_and_sides")
@@ -71,6 +72,7 @@ SENSOR_SCHEMA: Final[dict[str, Schema]] = {
         "gamma": Number("[0.5, 5]"),
         "black_level": Number("[-0.5, 0.5]", length=3, default=(0.0, 0.0, 0.0)),
         "vignetting": Number("[-10, 10]", length=3, default=(0.0, 0.0, 0.0)),
+        "colour_mix": Number("[-1, 1]", length=6, default=UNMIXED),
         "shading_red": Number("[-5, 5]", length=ANY, default=()),
         "shading_green": Number("[-5, 5]", length=ANY, default=()),
         "shading_blue": Number("[-5, 5]", length=ANY, default=()),
@@ -266,7 +268,7 @@ class CameraSpec:
 
 @dataclass(frozen=True)
 class ResponseSpec:
-    """u8 = 255 · clip(wb · exposure · vignette · shading · L + black)^(1/γ) of a radiance L."""
+    """u8 = 255 · clip(wb · exposure · vignette · shading · M L + black)^(1/γ) of a radiance L."""
 
     exposure: float | Literal["auto"]
     """Gain from radiance [W/(m² sr), relative] to full scale 1; ``AUTO``: rest is mid-grey.
@@ -280,6 +282,9 @@ class ResponseSpec:
     vignetting: Vec3
     """Coefficients (a1, a2, a3) of 1 + a1 r² + a2 r⁴ + a3 r⁶; all 0 is none.
     r: distance from the principal point over half the image's diagonal. The pinhole's cos⁴ fall-off is not added."""
+    colour_mix: tuple[float, ...] = UNMIXED
+    """Numbers off the diagonal of M, the colour matrix, row by row; those on it are 1.
+    Red of the image takes the first two of green's and blue's light. They are negative where a camera makes colours more saturated."""
     shading_red: tuple[float, ...] = ()
     """Colour shading, a smooth gain of red over the image: exp Σ c_ij T_i(x) T_j(y), i + j ≤ n.
     T: Chebyshev's polynomials; x, y: −1 to 1 over the image's width and height; in the order c_00, c_01 … c_0n, c_10 …:
@@ -296,6 +301,12 @@ class ResponseSpec:
         if self.exposure == AUTO:
             raise SpecError("must be a number here: with_exposure finds it", key="response.exposure", value=AUTO)
         return self.exposure
+
+    @property
+    def colour_matrix(self) -> tuple[Vec3, Vec3, Vec3]:
+        """M, row by row."""
+        rg, rb, gr, gb, br, bg = self.colour_mix
+        return (1.0, rg, rb), (gr, 1.0, gb), (br, bg, 1.0)
 
     @property
     def shading(self) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:

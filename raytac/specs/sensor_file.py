@@ -17,6 +17,7 @@ from raytac.specs.sensor import (
     SENSOR_PARTS,
     SENSOR_SCHEMA,
     SURFACE_SCHEMA,
+    UNMIXED,
     GelpadSpec,
     LedSpec,
     LightsSpec,
@@ -182,6 +183,8 @@ def response_text(response: ResponseSpec) -> str:
         f"black_level = {row(response.black_level)}",
         f"vignetting = {row(response.vignetting)}",
     ]
+    if response.colour_mix != UNMIXED:
+        lines.append(f"colour_mix = {row(response.colour_mix)}")
     for channel, coefficients in zip(("red", "green", "blue"), response.shading, strict=True):
         if not coefficients:
             continue

@@ -10,6 +10,7 @@ import numpy as np
 from raytac.errors import RaytacError
 from raytac.frame import TactileFrame
 from raytac.physics.geoms import geom_part
+from raytac.robots.looks import robot_looks
 from raytac.shapes.triangulate import part_surface
 from raytac.view.sensor_view import (
     coat_edges,
@@ -108,11 +109,12 @@ class WorldSession:
 
     def _geoms(self) -> Iterator[Solid]:
         model = self._world.model
+        looks = robot_looks(model)
         gels = {int(model.geom(mounted.gel).id) for mounted in self._world.composed.sensors}
         objects = {member for body in self._world.composed.bodies.values() for member in body.members}
         for geom in range(model.ngeom):
             red, green, blue, alpha = (float(v) for v in model.geom_rgba[geom])
-            if geom in gels or int(model.geom_group[geom]) >= _SHOWN_GROUPS or alpha == 0.0:
+            if geom in gels or geom in looks.hidden or int(model.geom_group[geom]) >= _SHOWN_GROUPS or alpha == 0.0:
                 continue
             body = int(model.geom_bodyid[geom])
             part = geom_part(model, geom)
@@ -128,6 +130,12 @@ class WorldSession:
             colour: Colour = (round(255 * red), round(255 * green), round(255 * blue))
             hides = body in objects and part.kind != "plane"
             yield Solid(name, vertices @ pose[:3, :3].T + pose[:3, 3], faces, colour, alpha, hides)
+        for number, (body, mesh) in enumerate(looks.meshes):
+            vertices, faces = mesh.surface()
+            name = f"{model.body(body).name}/looks{number}"
+            self._body_of[name] = body
+            red, green, blue = (round(255 * value) for value in mesh.rgba[:3])
+            yield Solid(name, vertices, faces, (red, green, blue), mesh.rgba[3])
 
     def _soft_bodies(self) -> Iterator[Solid]:
         for body in self._soft:

@@ -102,7 +102,17 @@ def compose(scene: TaskScene, physics: str) -> WorldModel:
     start, ctrl = _start(scene, model, arm, opening, fingers, bodies)
     steps = timestep, scene.control_timestep
     return WorldModel(
-        model, robot.sensors, tuple(bodies.values()), *steps, start, ctrl, scene=scene, arm=arm, opening=opening, fingers=fingers
+        model,
+        robot.sensors,
+        tuple(bodies.values()),
+        *steps,
+        start,
+        ctrl,
+        scene=scene,
+        arm=arm,
+        opening=opening,
+        fingers=fingers,
+        spec=spec,
     )
 
 

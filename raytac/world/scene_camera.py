@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from copy import copy
 
 import mujoco
 import numpy as np
 
 from raytac.errors import BackendError, InputError
+from raytac.robots.looks import Looks, robot_looks
+from raytac.se3 import pose, pose_of
 from raytac.world.world import TactileWorld
 
 _SHARP = 2
@@ -33,9 +37,13 @@ _GREEN = np.array([0.1, 0.7, 0.2, 0.8], np.float32)
 class SceneCamera:
     """Camera at a fixed pose in every environment of a world.
 
-    A scene without lamps of its own gets one that casts shadows, and its floor a grid of 0.1 m; neither is in the model. It needs OpenGL
-    without a display: MuJoCo reads the environment variable ``MUJOCO_GL`` (``egl`` or ``osmesa``) when it is imported.
+    A scene without lamps of its own gets one that casts shadows, and its floor a grid of 0.1 m; neither is in the model. Our Panda is
+    drawn by its visual meshes where a package with them is installed (docs/guide/robots.md), else by its collision shapes. It needs
+    OpenGL without a display: MuJoCo reads the environment variable ``MUJOCO_GL`` (``egl`` or ``osmesa``) when it is imported.
     Soft pads are not drawn, since MuJoCo does not have their gel.
+
+    Attributes:
+        model: copy of the world's model whose colours and lights are drawn.
     """
 
     def __init__(
@@ -51,7 +59,7 @@ class SceneCamera:
         """Open the renderer.
 
         Args:
-            world: world to draw. The headlight of its model is changed, which only pictures show.
+            world: world to draw.
             resolution: (width, height) [px], at most 640 x 480.
             distance: from the camera to ``lookat`` [m].
             azimuth, elevation: direction of the view [°].
@@ -66,22 +74,22 @@ class SceneCamera:
         if not (1 <= width <= largest[0] and 1 <= height <= largest[1]):
             raise InputError("resolution", value=resolution, rule=f"must be from 1x1 to {largest[0]}x{largest[1]} pixels")
         self.world, self.resolution = world, (width, height)
+        self.model = copy(world.model)
         self._has_lamp = world.model.nlight > 0
-        light = world.model.vis.headlight
+        light = self.model.vis.headlight
         light.ambient[:], light.diffuse[:], light.specular[:] = (0.35, 0.6, 0.1) if self._has_lamp else (0.45, 0.25, 0.0)
-        world.model.vis.quality.shadowsize = _SHADOWS
-        buffer = world.model.vis.global_
-        buffer.offwidth, buffer.offheight = _SHARP * width, _SHARP * height
+        self._drawn, self._looks = _with_meshes(world)
+        self.model.geom_rgba[list(self._looks.hidden), 3] = 0.0  # MuJoCo leaves such geoms out
+        self._drawn.vis.quality.shadowsize = _SHADOWS
+        self._drawn.vis.global_.offwidth, self._drawn.vis.global_.offheight = _SHARP * width, _SHARP * height
         try:
-            self._renderer = mujoco.Renderer(world.model, _SHARP * height, _SHARP * width)
+            self._renderer = mujoco.Renderer(self._drawn, _SHARP * height, _SHARP * width)
         except Exception as error:
             rule = "set MUJOCO_GL=egl (or osmesa) before Python starts, and install libEGL (or libOSMesa)"
             raise BackendError(f"MuJoCo cannot draw here ({error}): {rule}") from error
-        finally:
-            buffer.offwidth, buffer.offheight = largest
         if lookat is None:
             lookat = np.mean([poses[0, :3, 3] for poses in world.state().world_from_pad.values()], axis=0)
-        self._camera = mujoco.MjvCamera()
+        self._camera, self._option = mujoco.MjvCamera(), mujoco.MjvOption()
         self._camera.lookat[:] = lookat
         self._camera.distance, self._camera.azimuth, self._camera.elevation = distance, azimuth, elevation
 
@@ -92,7 +100,9 @@ class SceneCamera:
         """
         if not 0 <= env < self.world.num_envs:
             raise InputError("env", value=env, rule=f"must be from 0 to {self.world.num_envs - 1}")
-        self._renderer.update_scene(self.world.data[env], self._camera)
+        data, every = self.world.data[env], mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(self.model, data, self._option, None, self._camera, every, self._renderer.scene)
+        self._put_meshes(data)
         for point in points:
             self._add(mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, _BALL), np.asarray(point, float), np.eye(3), _GREEN)
         if not self._has_lamp:
@@ -110,6 +120,18 @@ class SceneCamera:
         if scene.ngeom < scene.maxgeom:
             mujoco.mjv_initGeom(scene.geoms[scene.ngeom], kind, size, at, turn.ravel(), colour)
             scene.ngeom += 1
+
+    def _put_meshes(self, data: mujoco.MjData) -> None:
+        """Add the visual meshes, which are the last meshes of the renderer's model."""
+        scene, drawn = self._renderer.scene, self._drawn
+        for mesh, (body, look) in enumerate(self._looks.meshes, start=drawn.nmesh - len(self._looks.meshes)):
+            body_from_mesh = pose_of(drawn.mesh_pos[mesh], drawn.mesh_quat[mesh])  # MuJoCo turns a mesh to its principal axes
+            place = pose(data.xmat[body].reshape(3, 3), data.xpos[body]) @ body_from_mesh
+            before = scene.ngeom
+            kind, colour = mujoco.mjtGeom.mjGEOM_MESH, np.array(look.rgba, np.float32)
+            self._add(kind, np.zeros(3), place[:3, 3], place[:3, :3], colour)
+            if scene.ngeom > before:
+                scene.geoms[before].dataid = 2 * mesh  # the odd numbers are convex hulls
 
     def _lay_floor(self) -> None:
         """Planes without a texture in a light grey, with a grid around the centre of the picture.
@@ -147,3 +169,18 @@ class SceneCamera:
     def close(self) -> None:
         """Free the renderer."""
         self._renderer.close()
+
+
+def _with_meshes(world: TactileWorld) -> tuple[mujoco.MjModel, Looks]:
+    """Model for a renderer: the world's, with the visual meshes of its robot behind its own."""
+    looks, spec = robot_looks(world.model), world.composed.spec
+    if spec is None or not looks.meshes:
+        return copy(world.model), Looks()
+    spec = spec.copy()
+    for number, (_, mesh) in enumerate(looks.meshes):
+        mesh.add_to(spec, f"looks/{number}")
+    try:
+        return spec.compile(), looks
+    except ValueError as error:
+        logging.getLogger("raytac").warning("the robot is drawn as its collision shapes: %s", " ".join(str(error).split()))
+        return copy(world.model), Looks()

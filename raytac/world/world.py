@@ -172,6 +172,7 @@ class TactileWorld:
                 control_timestep=control_timestep,
                 keyframe=keyframe,
                 allow_overlap=allow_overlap,
+                spec=scene if isinstance(scene, mujoco.MjSpec) else None,
             )
         else:
             assert self.scene is not None

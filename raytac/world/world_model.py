@@ -50,6 +50,8 @@ class WorldModel:
     """Actuator of the gap between two pads; None without one."""
     fingers: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     """Addresses in ``qpos`` of the joints whose sum is that gap."""
+    spec: mujoco.MjSpec | None = None
+    """Spec of which the model was compiled, for pictures; None of a compiled model."""
 
     @cached_property
     def bodies(self) -> dict[str, TouchedBody]:
@@ -88,6 +90,7 @@ def own_world_model(
     keyframe: str | None = None,
     allow_overlap: Sequence[str] = (),
     own_contact: bool = True,
+    spec: mujoco.MjSpec | None = None,
 ) -> WorldModel:
     """A user's own model, with its own start, options and controls.
 
@@ -98,6 +101,7 @@ def own_world_model(
         keyframe: the start; None is ``qpos0``.
         allow_overlap: geoms in which a gel may lie at the start.
         own_contact: pads push by the gel's law, and MuJoCo must not collide the gels; else it must, and pads only look.
+        spec: what the model was compiled of, for pictures.
 
     Raises:
         InputError: no ``MjModel``, what those two refuse, a gel that collides or does not, an option with which pads cannot be stepped, a
@@ -131,7 +135,8 @@ def own_world_model(
             raise InputError("keyframe", value=keyframe, rule=rule, choices=[name for name in names if name])
         key = names.index(keyframe)
         start, ctrl = model.key_qpos[key].copy(), model.key_ctrl[key].copy()
-    result = WorldModel(model, mounted, touched, timestep, float(control_timestep), start, ctrl, key)
+    kept = None if spec is None else spec.copy()
+    result = WorldModel(model, mounted, touched, timestep, float(control_timestep), start, ctrl, key, spec=kept)
     _check_gels(result, allow_overlap)
     return result
 

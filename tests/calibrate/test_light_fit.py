@@ -22,6 +22,8 @@ from raytac.specs import SensorSpec, load_sensor, with_lights
 from raytac.specs.sensor_check import validate_sensor
 
 RADIUS = 3.155e-3
+MIX = np.array([-0.04, -0.06, -0.02, -0.05, -0.03, -0.04])
+"""A colour matrix off its diagonal, for a white balance of 1."""
 NOISE = 1.5
 """Noise of a synthetic pixel [levels]."""
 
@@ -56,11 +58,13 @@ def traced(sensor: SensorSpec, at: np.ndarray, noise: float = 0.0) -> Photograph
     return Photographs(levels(GelSurface.at_rest(grid))[0], images, at, np.full(len(at), RADIUS))
 
 
-def direct(sensor: SensorSpec, at: np.ndarray) -> tuple[Photographs, FitState]:
+def direct(sensor: SensorSpec, at: np.ndarray, mix: np.ndarray | None = None) -> tuple[Photographs, FitState]:
     """Photographs by direct light alone, even over squares of 4 px, and the state that made them: no stray light, no vignette."""
     blank = Photographs(np.full((240, 320, 3), 100.0), np.full((len(at), 240, 320, 3), 100.0), at, np.full(len(at), RADIUS))
     p = LightParameters.of(sensor, blank.background)
-    state = FitState(dataclasses.replace(p, response=np.array([1.4, 0.0, 0.0, 0.0, 0.0, 0.0])), RIGID_PAD.copy(), at)
+    mix = np.zeros(6) if mix is None else mix
+    p = dataclasses.replace(p, response=np.array([1.4, 0.0, 0.0, 0.0, 0.0, 0.0]), mix=mix)
+    state = FitState(p, RIGID_PAD.copy(), at)
     every = DirectFit(sensor, blank, state, FitSettings(reach=99.0, samples=(10**6, 10**6)), factor=4)
     pressed, flat, _ = every.total(state.p, every.light(state.p, every.geometry(state)))
     small, presses = np.empty((60, 80, 3)), np.empty((len(at), 60, 80, 3))
@@ -91,7 +95,7 @@ def with_sizes(sensor: SensorSpec, sizes: list[tuple[float, float]]) -> SensorSp
 @pytest.mark.parametrize("kind", SIZES)
 def test_derivatives_agree_with_finite_differences(sensor: SensorSpec, kind: str) -> None:
     shots, state = direct(with_sizes(sensor, SIZES[kind]), circles(6))
-    p = dataclasses.replace(state.p, response=np.array([1.4, 0.3, 0.4, 0.5, -0.3, 0.05]))
+    p = dataclasses.replace(state.p, response=np.array([1.4, 0.3, 0.4, 0.5, -0.3, 0.05]), mix=MIX)
     state = dataclasses.replace(state, p=p)
     problem = DirectFit(sensor, shots, state, FitSettings(samples=(40, 40)), factor=4)
     plain, rng = problem.light(p, problem.geometry(state)), np.random.default_rng(4)
@@ -143,6 +147,42 @@ def test_known_lights_are_found_again(sensor: SensorSpec, known: tuple[Photograp
         np.abs(found.p.leds[:, :3] - true.p.leds[:, :3]).max() < 0.3 < 1 < np.abs(start.p.leds[:, :3] - true.p.leds[:, :3]).max()
     )
     assert np.abs(found.circles - true.circles).mean() < 0.5 * np.abs(labels - true.circles).mean()
+
+
+def test_a_known_colour_matrix_is_found_again(sensor: SensorSpec) -> None:
+    """From LEDs moved by 1 mm and an unmixed camera: the matrix to 0.01, and images to a quarter of a level."""
+    shots, true = direct(sensor, circles(6), MIX)
+    moved = true.p.leds + np.random.default_rng(1).normal(size=true.p.leds.shape) * [1, 1, 1, 0.1, 0.1, 0.4, 0, 0]
+    start = dataclasses.replace(true, p=dataclasses.replace(true.p, leds=moved, mix=np.zeros(6)))
+    settings = FitSettings(fixed=("gamma", "stray", "slope"), samples=(150, 100))
+    problem = DirectFit(sensor, shots, start, settings, factor=4)
+    found = problem.solve(start, 80)
+    assert np.abs(problem.residuals(found)[0]).mean() < 0.25 < 1 < np.abs(problem.residuals(start)[0]).mean()
+    np.testing.assert_allclose(found.p.mix, MIX, atol=0.01)
+    held = problem.with_fixed("mix").solve(start, 80)
+    assert not held.p.mix.any()
+    errors = [np.abs(problem.residuals(state)[0]).mean() for state in (found, held)]
+    assert errors[1] > 5 * errors[0], "powers of LEDs, which are positive, cannot stand for it"
+
+
+def test_the_ray_tracer_mixes_colours_as_the_fit_does(sensor: SensorSpec) -> None:
+    """Its images of a sensor with a colour matrix and a white balance: direct light with that matrix explains them, without it not."""
+    leds = tuple(dataclasses.replace(led, glow=0.0) for led in sensor.lights.leds)
+    balanced = dataclasses.replace(sensor.response, black_level=(0.0, 0.0, 0.0), white_balance=(1.2, 0.8, 1.0))
+    response = dataclasses.replace(balanced, colour_mix=tuple(MIX))
+    mixed = with_lights(dataclasses.replace(sensor, response=response), dataclasses.replace(sensor.lights, leds=leds))
+    at, grid = circles(2), make_grid(sensor.gelpad, 0.12e-3)
+    tracer = RayTraced(bounce=False, shadows=False).build(mixed, device="cpu")
+    pressed = tracer.render(press_surface(sensor, grid, at, np.full(2, RADIUS), RIGID_PAD)).rgb
+    rest = tracer.render(GelSurface.at_rest(grid)).rgb
+    assert pressed is not None and rest is not None
+    shots = Photographs(rest[0].astype(float), pressed.astype(float), at, np.full(2, RADIUS))
+    state, errors = FitState(LightParameters.of(mixed, shots.background), RIGID_PAD.copy(), at), []
+    for mix in (state.p.mix, np.zeros(6)):
+        own = dataclasses.replace(state, p=dataclasses.replace(state.p, mix=mix))
+        problem = DirectFit(mixed, shots, own, FitSettings(samples=(400, 200)), factor=2)
+        errors.append(float(np.abs(problem.residuals(own)[0][problem.inside]).mean()))
+    assert errors[0] < 0.5 and errors[1] > 3 * errors[0], errors
 
 
 @pytest.mark.slow
@@ -218,9 +258,10 @@ def test_too_few_presses_and_refraction_are_refused(sensor: SensorSpec, known: t
 
 def test_parameters_and_light_file_are_inverse(sensor: SensorSpec) -> None:
     background = np.full((8, 8, 3), 90.0)
-    p = LightParameters.of(sensor, background)
+    sensor = dataclasses.replace(sensor, response=dataclasses.replace(sensor.response, white_balance=(1.2, 0.8, 1.0)))
+    p = dataclasses.replace(LightParameters.of(sensor, background), mix=MIX)
     again = LightParameters.of(with_parameters(sensor, p, background), background)
-    for name in ("leds", "power", "glow", "response"):
+    for name in ("leds", "power", "glow", "response", "mix"):
         np.testing.assert_allclose(getattr(again, name), getattr(p, name), rtol=1e-6, atol=1e-9, err_msg=name)
     assert p.glow.min() > 0
 
@@ -332,7 +373,7 @@ def test_the_prior_that_serves_presses_elsewhere_best_is_chosen(sensor: SensorSp
     shots, true = direct(sensor, circles(8))
     moved = dataclasses.replace(true.p, leds=true.p.leds + np.array([3.0, 0, 0, 0, 0.3, 0, 0, 0]))
     start = with_parameters(sensor, moved, shots.background)
-    settings = FitSettings(fixed=("gamma", "slope", "stray"))
+    settings = FitSettings(fixed=("gamma", "slope", "stray", "mix"))
     found, errors = choose_strength(start, shots, settings, candidates={"tied-dark": {"prior": 1e7}, "free": {"prior": 30.0}})
     assert found == "free" and errors["free"] < 0.6 * errors["tied-dark"], "a clear difference beats custom"
     usual = {"tied-dark": {"prior": 30.0}, "free": {"prior": 60.0}}

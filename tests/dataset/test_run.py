@@ -109,6 +109,53 @@ def test_another_sweep_does_not_mix_in(sweep: SweepSpec, folder: Path, whole: di
         rendered(DatasetPlan(light(sweep)), folder)
 
 
+def test_more_presses_are_added_to_a_data_set_and_fewer_are_refused(
+    sweep: SweepSpec, folder: Path, whole: dict[str, bytes], tmp_path: Path
+) -> None:
+    """As if all had been rendered in one go; only the last shard, which was not full, is rendered again."""
+    longer = DatasetPlan(replace(light(sweep), count=14))
+    rendered(longer, tmp_path / "at_once")
+    before = (folder / "shards/000001.npz").stat().st_mtime_ns
+    told: list[str] = []
+    report = rendered(longer, folder, told)
+    assert report.rendered == 2 and report.presses == 6 and (folder / "shards/000001.npz").stat().st_mtime_ns == before
+    assert contents(folder) == contents(tmp_path / "at_once")
+    assert "000002 has 2 of 4 presses: rendered again" in told and verify_dataset(folder).wrong == {}
+    with pytest.raises(InputError, match="holds 14 presses, more than the 10 asked for: choose another folder"):
+        rendered(DatasetPlan(light(sweep)), folder)
+    assert contents(folder) == contents(tmp_path / "at_once")
+    with pytest.raises(InputError, match="differs in count, seed: choose another folder"):
+        rendered(DatasetPlan(replace(light(sweep), count=20, seed=6)), folder)
+
+
+def test_an_addition_that_is_killed_goes_on(
+    sweep: SweepSpec, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    longer = DatasetPlan(replace(light(sweep), count=14))
+    rendered(longer, tmp_path / "at_once")
+    with monkeypatch.context() as patch:
+        patch.setattr("raytac.dataset.run.write_description", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            rendered(longer, folder)
+    assert json.loads((folder / "dataset.json").read_text())["presses"] == 10
+    with monkeypatch.context() as patch:
+        patch.setattr(ShardRenderer, "render", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            rendered(longer, folder)
+    said = json.loads((folder / "dataset.json").read_text())
+    assert said["presses"] == 14 and not said["complete"] and set(verify_dataset(folder).wrong) == {2, 3}
+    assert rendered(longer, folder).rendered == 2 and contents(folder) == contents(tmp_path / "at_once")
+
+
+def test_a_disk_without_room_for_more_presses_leaves_the_data_set_as_it_is(
+    sweep: SweepSpec, folder: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("raytac.dataset.run.shutil.disk_usage", lambda folder: SimpleNamespace(free=1000))
+    with pytest.raises(InputError, match="GB free"):
+        rendered(DatasetPlan(replace(light(sweep), count=14)), folder)
+    assert contents(folder) == whole
+
+
 def test_a_full_disk_and_bad_arguments_are_told_before_anything_is_rendered(
     plan: DatasetPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,6 +22,7 @@ CURVE = ResponseSpec(
     gamma=1.8,
     black_level=(0.01, 0.02, 0.0),
     vignetting=(-0.3, 0.1, -0.05),
+    colour_mix=(-0.02, 0.03, 0.1, -0.1, 0.05, -0.2),
 )
 
 
@@ -32,16 +33,17 @@ def linear_image(shape: tuple[int, ...] = (60, 80, 3)) -> np.ndarray:
 def test_the_formula(tracer: Build) -> None:
     camera = replace(tracer(like_a_mini()).camera, principal=(35.0, 33.0))
     image = linear_image()
+    mixed = image @ np.array([[1, -0.02, 0.03], [0.1, 1, -0.1], [0.05, -0.2, 1]], np.float32).T
     encoded = Response(CURVE, camera).encode_numpy(image)
     for row, column in ((0, 0), (33, 35), (59, 79), (10, 60)):
         r = np.hypot(column + 0.5 - 35.0, row + 0.5 - 33.0) / (0.5 * np.hypot(80, 60))
         vignette = 1 - 0.3 * r**2 + 0.1 * r**4 - 0.05 * r**6
         for c in range(3):
-            value = CURVE.white_balance[c] * CURVE.gain * vignette * image[row, column, c] + CURVE.black_level[c]
+            value = CURVE.white_balance[c] * CURVE.gain * vignette * mixed[row, column, c] + CURVE.black_level[c]
             expected = 255 * min(max(value, 0), 1) ** (1 / 1.8)
             assert abs(float(encoded[row, column, c]) - expected) <= 0.51, (row, column, c)
     assert (encoded == 255).any()  # clipped, not wrapped around
-    assert Response(CURVE, camera).encode_numpy(-image).max() <= 255 * 0.02 ** (1 / 1.8) + 1
+    assert Response(CURVE, camera).encode_numpy(np.full_like(image, -0.3)).max() <= 255 * 0.02 ** (1 / 1.8) + 1
 
 
 def test_device_and_host_encode_alike(tracer: Build) -> None:

@@ -1,4 +1,4 @@
-"""Dense symmetric matrices, factored and multiplied by one block of threads each.
+"""Dense symmetric matrices, inverted by one block of threads each.
 
 A = Uᵀ U is computed by panels of ``PANEL`` rows (a left-looking Cholesky factorisation). A thread works on columns, two at a time, and
 keeps the panel's share of both in registers while it runs down the rows above. Threads side by side read numbers side by side, and all
@@ -132,18 +132,6 @@ def factor_block(u: FloatArray3d, env: wp.int32, row: wp.int32) -> mat66d:
 
 
 @wp.func
-def solve(u: FloatArray3d, b: FloatArray3d, y: FloatArray3d, env: wp.int32, size: wp.int32, lane: wp.int32, lanes: wp.int32):
-    """y = U⁻ᵀ b, with U of :func:`factor`."""
-    for c in range(lane, size, 2 * lanes):
-        d = wp.where(c + lanes < size, c + lanes, c)
-        for p in range(size / PANEL):
-            row = PANEL * p
-            x = read_panel(b, env, row, c, d) - panel_sums(u, y, env, row, c, d, 0, row)
-            write_panel(substitute(factor_block(u, env, row), x), y, env, row, c, d)
-    wait_for_block()
-
-
-@wp.func
 def solve_identity(u: FloatArray3d, y: FloatArray3d, env: wp.int32, size: wp.int32, lane: wp.int32, lanes: wp.int32):
     """y = U⁻ᵀ, zero above its diagonal."""
     one = wp.float64(1.0)
@@ -166,17 +154,8 @@ def solve_identity(u: FloatArray3d, y: FloatArray3d, env: wp.int32, size: wp.int
 
 
 @wp.func
-def gram(
-    b: FloatArray3d,
-    y: FloatArray3d,
-    is_lower: wp.bool,
-    out: FloatArray3d,
-    env: wp.int32,
-    size: wp.int32,
-    lane: wp.int32,
-    lanes: wp.int32,
-):
-    """out = b − yᵀ y, with the upper half of b; of a lower triangular y out = yᵀ y.
+def gram(y: FloatArray3d, out: FloatArray3d, env: wp.int32, size: wp.int32, lane: wp.int32, lanes: wp.int32):
+    """out = yᵀ y of a lower triangular y.
 
     Warps take chunks of columns in turn.
     """
@@ -189,11 +168,7 @@ def gram(
             c = start + lane % width
             if task % groups == group and c < size:
                 d = wp.where(c + width < size, c + width, c)
-                x = mat62d()
-                if is_lower:
-                    x = panel_sums(y, y, env, row, c, d, c - c % PANEL, size)
-                else:
-                    x = read_panel(b, env, row, c, d) - panel_sums(y, y, env, row, c, d, 0, size)
+                x = panel_sums(y, y, env, row, c, d, c - c % PANEL, size)
                 for i in range(PANEL):
                     if c >= row + i:
                         out[env, row + i, c] = x[i, 0]
@@ -203,3 +178,16 @@ def gram(
                         out[env, d, row + i] = x[i, 1]
             task += 1
     wait_for_block()
+
+
+@wp.func
+def invert(a: FloatArray3d, y: FloatArray3d, env: wp.int32, size: wp.int32, lane: wp.int32, lanes: wp.int32) -> wp.bool:
+    """A⁻¹ = U⁻¹ U⁻ᵀ takes the place of A, of which the upper half counts; y becomes U⁻ᵀ.
+
+    All threads get the same result: False where a pivot is not positive.
+    """
+    if not factor(a, env, size, lane, lanes):
+        return False
+    solve_identity(a, y, env, size, lane, lanes)
+    gram(y, a, env, size, lane, lanes)
+    return True

@@ -8,8 +8,11 @@ A = L Lᵀ is factored in each Newton iteration. By Woodbury's identity
 
 The second form needs no inverse of S, which is not regular where friction is missing. An affine body is 10⁶ times as stiff against strain
 as against motion: its unknowns are Lᵀ x and its rows L⁻¹ q here, for which K = 1; otherwise the difference would be lost to rounding.
-W is computed in double precision by one block of threads an environment (``dense.py``). An environment with more contact nodes than there
-is room for is marked as one that does not fit: with part of its contacts the identity is of little use.
+Inverses are computed in double precision by one block of threads an environment (``dense.py``). W itself is not: it is needed for few
+products in a Newton iteration, and three matrices times a vector have less arithmetic than a product of matrices.
+
+An environment with more contact nodes than there is room for is marked as one that does not fit: with part of its contacts the identity is
+of little use.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -24,7 +27,7 @@ from ipc.contact.contacts import Contacts, mat34d, rows_of
 from ipc.solver.affine_elimination import Elimination, finish_elimination
 from ipc.solver.blocks import wait_for_block
 from ipc.solver.linear import SystemView, row_column
-from ipc.solver.preconditioners.dense import PANEL, factor, gram, solve, solve_identity
+from ipc.solver.preconditioners.dense import PANEL, invert
 
 wp.set_module_options({"enable_backward": False})
 
@@ -66,8 +69,9 @@ class Small:
     ``touched``, ``slot`` (B, s): mark of a surface node that touches, and its place among the contact nodes.
     ``count`` (B,): contact nodes; more than m do not fit.    ``pads`` (B,): those of pads, the first ones.    ``node`` (B, m).
     ``known`` (B,): pad nodes of which ``k`` is K; −1 after ``node`` has changed.
-    ``s`` (B, 3m, 3m): the upper half of S, zero after W was computed.    ``k`` (B, 3m, 3m): K.    ``w`` (B, 3m, 3m): W [N/m].
-    ``t``, ``force`` (B, 3m): J K_0⁻¹ r [m], on affine nodes L⁻¹ r, and W t [N].
+    ``s`` (B, 3m, 3m): the upper half of S, zero after the inverse was computed.    ``k`` (B, 3m, 3m): K of pad nodes [N/m].
+    ``inverse`` (B, 3m, 3m): (K + S)⁻¹ [m/N].
+    ``t``, ``force`` (B, 3m): J K_0⁻¹ r [m], on affine nodes L⁻¹ r, later a product; and W t [N].
     ``root`` (B, A, 4): blocks of an affine node's row of L⁻¹, at the nodes of its body.
     """
 
@@ -79,7 +83,7 @@ class Small:
     known: IntArray
     s: FloatArray3d
     k: FloatArray3d
-    w: FloatArray3d
+    inverse: FloatArray3d
     t: FloatArray2d
     force: FloatArray2d
     root: wp.array3d(dtype=wp.mat33d)
@@ -349,20 +353,13 @@ def find_stiffness(rest: Rest, small: Small, env: wp.int32, lane: wp.int32, lane
             a, b = small.node[env, i / 3], small.node[env, j / 3]
             if rest.part[a] == rest.part[b]:
                 value = wp.float64(rest_entry(rest, rest.part[a], rest.unknown[a] + i % 3, rest.unknown[b] + j % 3))
-        small.w[env, i, j] = value
-    if not factor(small.w, env, size, lane, lanes):
-        return False
-    solve_identity(small.w, small.k, env, size, lane, lanes)
-    gram(small.k, small.k, True, small.w, env, size, lane, lanes)
-    for e in range(lane, size * size, lanes):
-        small.k[env, e / size, e % size] = small.w[env, e / size, e % size]
-    wait_for_block()
-    return True
+        small.k[env, i, j] = value
+    return invert(small.k, small.inverse, env, size, lane, lanes)
 
 
 @wp.kernel(launch_bounds=(LANES, 2))
-def factor_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
-    """W = K − (U⁻ᵀ K)ᵀ (U⁻ᵀ K) with K + S = Uᵀ U, one block of threads an environment.
+def invert_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
+    """(K + S)⁻¹, one block of threads an environment.
 
     It leaves ``s`` zero for the next S.
     """
@@ -380,18 +377,15 @@ def factor_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
         for e in range(lane, size * size, lanes):
             i = e / size
             j = e - size * i
-            if i >= pads or j >= pads:
-                value = wp.float64(0.0)
-                if i == j:
-                    value = wp.float64(1.0)
-                small.k[env, i, j] = value
             if i <= j:
-                small.w[env, i, j] = small.k[env, i, j] + small.s[env, i, j]
-        good = factor(small.w, env, size, lane, lanes)
-    if good:
-        solve(small.w, small.k, small.s, env, size, lane, lanes)
-        gram(small.k, small.s, False, small.w, env, size, lane, lanes)
-    else:
+                value = small.s[env, i, j]
+                if j < pads:
+                    value += small.k[env, i, j]
+                elif i == j:
+                    value += wp.float64(1.0)
+                small.inverse[env, i, j] = value
+        good = invert(small.inverse, small.s, env, size, lane, lanes)
+    if not good:
         # Something is not finite: without contacts it is still a preconditioner.
         wait_for_block()
         if lane == 0:
@@ -406,6 +400,18 @@ def sum_of_parts(y: SingleArray3d, place: wp.int32, u: wp.int32) -> wp.float32:
     total = wp.float32(0.0)
     for c in range(y.shape[0]):
         total += y[c, place, u]
+    return total
+
+
+@wp.func
+def stiffness_row(small: Small, env: wp.int32, i: wp.int32, x: FloatArray2d) -> wp.float64:
+    """(K x)_i; K is 1 for affine bodies."""
+    pads = 3 * small.pads[env]
+    if i >= pads:
+        return x[env, i]
+    total = wp.float64(0.0)
+    for j in range(pads):
+        total += small.k[env, j, i] * x[env, j]
     return total
 
 
@@ -429,10 +435,16 @@ def contact_forces(
             small.t[env, i] = wp.float64(sum_of_parts(y, place[env], rest.unknown[node] + i % 3))
     wait_for_block()
     for i in range(lane, n, lanes):
+        small.force[env, i] = stiffness_row(small, env, i, small.t)
+    wait_for_block()
+    for i in range(lane, n, lanes):
         total = wp.float64(0.0)
         for j in range(n):
-            total += small.w[env, j, i] * small.t[env, j]
-        small.force[env, i] = total
+            total += small.inverse[env, j, i] * small.force[env, j]
+        small.t[env, i] = total
+    wait_for_block()
+    for i in range(lane, n, lanes):
+        small.force[env, i] = small.force[env, i] - stiffness_row(small, env, i, small.t)
 
 
 @wp.kernel
@@ -466,7 +478,7 @@ def affine_motion(rest: Rest, small: Small, env: wp.int32, a: wp.int32, r: VecAr
     s = rest.surface[rest.affine_node[first]]
     for i in range(a - first, 4):
         f = scaled_force(rest, small, env, first + i, r)
-        if small.count[env] > 0 and small.touched[env, s] != 0:  # none are left where W could not be computed
+        if small.count[env] > 0 and small.touched[env, s] != 0:  # none are left where the inverse could not be computed
             k = 3 * (small.slot[env, s] + i)
             f -= wp.vec3d(small.force[env, k], small.force[env, k + 1], small.force[env, k + 2])
         x += wp.transpose(small.root[env, first + i, a - first]) * f
@@ -479,7 +491,7 @@ def even(room: int) -> int:
 
 
 class LowRank:
-    """Contact nodes, their factored small systems W, and products with these.
+    """Contact nodes, their small systems, and products with W.
 
     Args:
         room: contact nodes that an environment may have.
@@ -500,7 +512,7 @@ class LowRank:
         small.count, small.pads = zeros(batch, dtype=wp.int32), zeros(batch, dtype=wp.int32)
         small.node = zeros(batch, room, dtype=wp.int32)
         small.known = wp.full(batch, -1, dtype=wp.int32, device=device)
-        small.s, small.k, small.w = (zeros(batch, 3 * room, 3 * room, dtype=wp.float64) for _ in range(3))
+        small.s, small.k, small.inverse = (zeros(batch, 3 * room, 3 * room, dtype=wp.float64) for _ in range(3))
         small.t, small.force = zeros(batch, 3 * room, dtype=wp.float64), zeros(batch, 3 * room, dtype=wp.float64)
         self.bodies = len(rest.affine_node) // 4
         small.root = zeros(batch, 4 * self.bodies, 4, dtype=wp.mat33d)
@@ -530,7 +542,7 @@ class LowRank:
             if self.bodies:
                 inputs = [contacts, rest, active, self.lanes, small]
                 self._launch(add_bodies, (self.batch, self.bodies, self.lanes), inputs, self.lanes)
-            self._launch(factor_small, (self.batch, self.lanes), [rest, active, self.lanes, small], self.lanes)
+            self._launch(invert_small, (self.batch, self.lanes), [rest, active, self.lanes, small], self.lanes)
 
     def find_forces(self, y: wp.array, z: wp.array, running: wp.array, place: wp.array) -> None:
         """Compute ``small.force`` = W t for the running environments.

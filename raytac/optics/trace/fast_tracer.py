@@ -189,5 +189,6 @@ def with_exposure(sensor: SensorSpec, device: str = "auto") -> SensorSpec:
     plain = replace(sensor, response=replace(sensor.response, exposure=1.0))
     tracer = FastTracer(plain, RayTraced(), outputs=("layers",), device=device)
     rest = GelSurface.at_rest(make_grid(sensor.gelpad, grid_pitch(sensor.camera.pitch_at(sensor.camera.resolution))))
-    exposure = mid_grey_exposure(sensor, total(tracer.render_layers(rest))[0] * tracer.response.scale)
+    light = tracer.response.mixed(total(tracer.render_layers(rest))[0])
+    exposure = mid_grey_exposure(sensor, light * tracer.response.scale)
     return replace(sensor, response=replace(sensor.response, exposure=exposure))

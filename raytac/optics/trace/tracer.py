@@ -103,7 +103,9 @@ class Tracer(DeviceMode):
             return
         response, advice = self.sensor.response, "the light is too uneven for any exposure"
         try:
-            grey = mid_grey_exposure(self.sensor, self._rest_light(rest) * self.camera.cut(self.response.scale) / response.gain)
+            grey = mid_grey_exposure(
+                self.sensor, self.response.mixed(self._rest_light(rest)) * self.camera.cut(self.response.scale) / response.gain
+            )
         except SpecError:
             grey = response.gain
         if abs(grey - response.gain) > 0.1 * grey:

@@ -151,7 +151,6 @@ class GelContact:
         response.mass = self._zeros((num_envs, nv, nv), wp.float64)
         response.rows = self._zeros((num_envs, world.ROWS * together, nv), wp.float64)
         response.other = self._zeros((num_envs, world.ROWS, nv), wp.float64)
-        response.own = self._zeros((num_envs, world.ROWS * together), wp.float64)
         response.state = self._zeros((num_envs, nv), wp.float64)
         self.lifts.solves, self.lifts.response = solves, response
 

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.physics.rigid.response_kernels import Response, add_force, factorise, vec6d, velocity_by
+from raytac.physics.rigid.response_kernels import Response, add_force, factorise, own_response, vec6d, velocity_by
 from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -40,9 +40,9 @@ _FALLS = wp.constant(wp.float64(0.5))
 _SWEEPS = wp.constant(wp.int32(300))
 """Most sweeps over the contacts; some thirty suffice for two pads."""
 _INNER = wp.constant(wp.int32(3))
-"""Solves of one contact in a sweep."""
+"""Most steps for one contact in a sweep, where there are others."""
 _SETTLED = wp.constant(wp.float64(2e-7))
-"""Change of a force in a sweep, over the greatest normal force, at which sweeps end."""
+"""Change of a force, over the greatest normal force, at which steps and sweeps end."""
 LEAST_FRICTION = wp.constant(wp.float64(1e-6))
 """Least coefficient of friction, which MuJoCo wants positive."""
 _ROWS = wp.constant(wp.int32(ROWS))
@@ -100,43 +100,55 @@ def lift_of(slots: Slots, i: wp.int32, slot: wp.vec2i, law: vec6d) -> wp.float64
 
 
 @wp.func
-def settle_contact(slots: Slots, step: wp.float64, lifts: Lifts, i: wp.int32, k: wp.int32) -> wp.float64:
-    """Solve the law of one contact under the present forces of the others.
+def settle_contact(slots: Slots, step: wp.float64, lifts: Lifts, i: wp.int32, k: wp.int32, most: wp.int32) -> wp.float64:
+    """Solve the law of one contact under the forces of the others, by up to ``most`` steps.
 
-    Returns the greatest change of a force [N].
+    Returns the greatest change of a force [N]. The numbers of the contact stay in registers: a step reads no memory.
     """
-    slot, change = lifts.slot[i, k], wp.float64(0.0)
-    pad, body = slot[0], slot[1]
-    friction, first = wp.max(slots.friction[i, pad, body, 0], LEAST_FRICTION), _ROWS * k
-    give = wp.float64(0.0)
-    for m in range(1, _ROWS):
-        give = wp.max(give, lifts.response.own[i, first + m] / (slots.regularisation[i, pad, body, m] * step))
-    for _ in range(_INNER):
-        velocity = vec6d()
-        velocity[0] = lifts.free[i, first] + velocity_by(lifts.response, i, first)
-        before = lifts.force[i, first] + _0
-        stiff = _1 / (slots.regularisation[i, pad, body, 0] * step)
-        wanted = slots.force[i, pad, body, 0] + slots.lift[i, pad, body] - stiff * velocity[0]
-        normal = wp.max(before + (wanted - before) / (_1 + stiff * lifts.response.own[i, first]), _0)
-        lifts.force[i, first] = normal
-        add_force(lifts.response, i, first, normal - before)
-        change = wp.max(change, wp.abs(normal - before))
+    slot, greatest = lifts.slot[i, k], wp.float64(0.0)
+    pad, body, first = slot[0], slot[1], _ROWS * k
+    friction = wp.max(slots.friction[i, pad, body, 0], LEAST_FRICTION)
+    own = own_response(lifts.response, i, first)
+    before, free, stiff, scale, wanted, give = vec6d(), vec6d(), vec6d(), vec6d(), vec6d(), wp.float64(0.0)
+    for m in range(_ROWS):
+        before[m] = lifts.force[i, first + m]
+        free[m] = lifts.free[i, first + m] + velocity_by(lifts.response, i, first + m)
+        stiff[m] = _1 / (slots.regularisation[i, pad, body, m] * step)
+        wanted[m] = slots.force[i, pad, body, m]
+        scale[m] = _1
+        if m == 0:
+            wanted[m] = wanted[m] + slots.lift[i, pad, body]
+        else:
+            scale[m] = friction / wp.max(slots.friction[i, pad, body, m - 1], LEAST_FRICTION)
+            give = wp.max(give, own[m, m] * stiff[m])
+    free -= own * before  # of the forces of others
+    force, n = before + vec6d(), wp.int32(0)
+    while n < most:
+        n += 1
+        speed = free[0]
+        for m in range(_ROWS):
+            speed += own[0, m] * force[m]
+        more = (wanted[0] - stiff[0] * speed - force[0]) / (_1 + stiff[0] * own[0, 0])
+        normal = wp.max(force[0] + more, _0)
+        change = wp.abs(normal - force[0])
+        force[0] = normal
+        velocity, law, square = free + own * force, vec6d(), wp.float64(0.0)
         for m in range(1, _ROWS):
-            velocity[m] = lifts.free[i, first + m] + velocity_by(lifts.response, i, first + m)
-        law, square = law_at(slots, step, i, slot, velocity), wp.float64(0.0)
-        for m in range(1, _ROWS):
-            scale = friction / wp.max(slots.friction[i, pad, body, m - 1], LEAST_FRICTION)
-            now = scale * lifts.force[i, first + m]
-            law[m] = now + (law[m] - now) / (_1 + give)
+            now = scale[m] * force[m]
+            law[m] = now + (scale[m] * (wanted[m] - stiff[m] * velocity[m]) - now) / (_1 + give)
             square += law[m] * law[m]
         share = wp.min(friction * normal / wp.max(wp.sqrt(square), wp.float64(1e-30)), _1)
         for m in range(1, _ROWS):
-            scale = friction / wp.max(slots.friction[i, pad, body, m - 1], LEAST_FRICTION)
-            more = share * law[m] / scale - lifts.force[i, first + m]
-            lifts.force[i, first + m] = lifts.force[i, first + m] + more
-            add_force(lifts.response, i, first + m, more)
-            change = wp.max(change, scale * wp.abs(more))
-    return change
+            new = share * law[m] / scale[m]
+            change = wp.max(change, scale[m] * wp.abs(new - force[m]))
+            force[m] = new
+        greatest = wp.max(greatest, change)
+        if change <= _SETTLED * normal:
+            n = most
+    for m in range(_ROWS):
+        lifts.force[i, first + m] = force[m]
+        add_force(lifts.response, i, first + m, force[m] - before[m])
+    return greatest
 
 
 @wp.func
@@ -148,11 +160,12 @@ def settle(slots: Slots, step: wp.float64, lifts: Lifts, i: wp.int32, count: wp.
         add_force(lifts.response, i, row, lifts.force[i, row])
     for row in range(_ROWS * count):
         lifts.free[i, row] = lifts.free[i, row] - velocity_by(lifts.response, i, row)
-    sweep = wp.int32(0)
-    while sweep < _SWEEPS:
+    # A lone contact waits for no other.
+    sweep, sweeps, most = wp.int32(0), wp.where(count == 1, 1, _SWEEPS), wp.where(count == 1, _SWEEPS * _INNER, _INNER)
+    while sweep < sweeps:
         change, largest = wp.float64(0.0), wp.float64(0.0)
         for k in range(count):
-            change = wp.max(change, settle_contact(slots, step, lifts, i, k))
+            change = wp.max(change, settle_contact(slots, step, lifts, i, k, most))
             largest = wp.max(largest, lifts.force[i, _ROWS * k])
         sweep += 1
         if change <= _SETTLED * largest:

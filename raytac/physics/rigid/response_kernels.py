@@ -24,6 +24,7 @@ from raytac.physics.rigid.world_kernels import ROWS
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 vec6d = wp.types.vector(length=ROWS, dtype=wp.float64)
+mat66d = wp.types.matrix(shape=(ROWS, ROWS), dtype=wp.float64)
 
 ACTIVE = wp.constant(wp.int32(1))
 """State of a constraint row whose cost is quadratic, in MuJoCo's ``mjtConstraintState``."""
@@ -43,8 +44,6 @@ class Response:
     """J_g, then Y, (n, 6 K, nv)."""
     other: wp.array3d(dtype=wp.float64)
     """Rows of one other constraint, (n, 6, nv)."""
-    own: wp.array2d(dtype=wp.float64)
-    """Diagonal of W, (n, 6 K)."""
     state: wp.array2d(dtype=wp.float64)
     """Yᵀ p, (n, nv)."""
 
@@ -120,16 +119,24 @@ def factorise(response: Response, i: wp.int32, count: wp.int32, step: wp.float64
                 response.mass[i, m, k] = value / response.mass[i, k, k]
     root = wp.sqrt(step)
     for row in range(count):
-        total = wp.float64(0.0)
         for m in range(nv):
             value = root * response.rows[i, row, m]
             for n in range(m):
                 value -= response.mass[i, m, n] * response.rows[i, row, n]
             value /= response.mass[i, m, m]
             response.rows[i, row, m] = value
-            total += value * value
-        response.own[i, row] = total
     return True
+
+
+@wp.func
+def own_response(response: Response, i: wp.int32, first: wp.int32) -> mat66d:
+    """W between the rows of the contact whose first row is ``first``."""
+    result, values = mat66d(), vec6d()
+    for m in range(response.rows.shape[2]):
+        for j in range(ROWS):
+            values[j] = response.rows[i, first + j, m]
+        result += wp.outer(values, values)
+    return result
 
 
 @wp.func

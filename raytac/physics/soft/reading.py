@@ -212,7 +212,7 @@ class _Batch:
         self._sound, self._load = self._zeros(num_envs, dtype=wp.int32), self._zeros(num_envs, vertices, dtype=wp.float64)
         self._solved, self._none_failed = self._zeros(0, dtype=wp.float64), self._zeros(num_envs, dtype=wp.bool)
         self._height, self._contact = (self._zeros(num_envs, *grid.shape, dtype=dtype) for dtype in (wp.float32, wp.uint8))
-        self._above_rest = self._zeros(num_envs, *grid.shape, dtype=wp.float32)
+        self._single_rest = self._on_device(grid.rest[None].astype(np.float32), wp.float32)
         self._coat, self._centre = self._zeros(num_envs, vertices, dtype=wp.vec3d), self._zeros(num_envs, dtype=wp.vec2d)
         self.unread = self._zeros(num_envs, dtype=wp.bool)
         self._state: CoatState | None = None
@@ -304,8 +304,8 @@ class _Batch:
         ]
         self._launch(normal_kernels.lay, lines, [*laid, *fields])
         tangential.correct(state.objects)
-        self._launch(kernels.above_rest, lines, [self._height, self._rest, self._above_rest])
-        placed = [clearance, tangential.displacement, self._lines, self._above_rest, state.vertices, self._coat]
+        heights = [self._height, self._single_rest]
+        placed = [clearance, tangential.displacement, self._lines, *heights, state.vertices, self._coat]
         self._launch(kernels.place_coat, self._coat.shape, [self._surface.struct, *placed])
 
     @cached_property

@@ -80,20 +80,9 @@ def show_plain(
 
 
 @wp.kernel
-def above_rest(
-    height: wp.array3d(dtype=wp.float32), rest: wp.array2d(dtype=wp.float64),
-    # outputs
-    rise: wp.array3d(dtype=wp.float32),
-):  # fmt: skip
-    env, row = wp.tid()
-    for i in range(height.shape[2]):
-        rise[env, row, i] = wp.float32(wp.float64(height[env, row, i]) - rest[row, i])
-
-
-@wp.kernel
 def place_coat(
     coat: Coat, clearance: wp.array(dtype=wp.float64), sideways: wp.array2d(dtype=wp.float64), lines: Lines,
-    rise: wp.array3d(dtype=wp.float32), vertices: wp.array2d(dtype=wp.vec3d),
+    height: wp.array3d(dtype=wp.float32), rest: wp.array3d(dtype=wp.float32), vertices: wp.array2d(dtype=wp.vec3d),
     # outputs
     out: wp.array2d(dtype=wp.vec3d),
 ):  # fmt: skip
@@ -106,7 +95,8 @@ def place_coat(
     x, y = coat.rest[v][0] + sideways[env, v], coat.rest[v][1] + sideways[env, count + v]
     # Beyond the pad's edge the height is that at the edge.
     at = wp.vec2d(on_pad(coat.lines_x, x), on_pad(coat.lines_y, y))
-    out[env, v] = wp.vec3d(x, y, rest_at(coat, at[0], at[1]) + sampled(rise, env, lines, at))
+    rise = sampled(height, env, lines, at) - sampled(rest, 0, lines, at)
+    out[env, v] = wp.vec3d(x, y, rest_at(coat, at[0], at[1]) + rise)
 
 
 @wp.kernel

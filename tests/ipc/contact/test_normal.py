@@ -54,6 +54,7 @@ class Scene:
         s.dx.zero_()
         s.collision.refresh(s.x, s.dx, s.everyone)
         s.touch(s.everyone)
+        s.add_friction(s.everyone)
         return float(s.barrier.numpy()[0]), s.vert_gradient.numpy()[0].copy()
 
     def hessian(self, definite: bool = False) -> np.ndarray:

@@ -1,5 +1,8 @@
 """Contact rows over the unknowns of soft nodes and of one or two affine bodies: products, and their part in the rest inverse."""
 
+# pyright: reportInvalidTypeForm=false, reportCallIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
+# pyright: reportIndexIssue=false
+
 from __future__ import annotations
 
 from typing import Any
@@ -9,8 +12,12 @@ import pytest
 import warp as wp
 
 import ipc
+from ipc.arrays import FloatArray, VecArray2d
+from ipc.contact.contacts import Contacts
 from ipc.reduce import BLOCK
-from ipc.solver.linear import multiply_blocks, multiply_rows
+from ipc.solver.halves import multiply_half
+from ipc.solver.linear import SystemView, multiply_blocks, multiply_rows
+from ipc.solver.potential import Potential
 from ipc.solver.preconditioners.rest_inverse import RestInverse
 from tests.ipc.conftest import bonded_pad, small_pad
 
@@ -23,7 +30,7 @@ DEVICES = [
 class Rows:
     """A pad at rest, two affine boxes far from it, and random contact rows between all; H as a dense matrix."""
 
-    def __init__(self, count: int, rng: np.random.Generator, device: str) -> None:
+    def __init__(self, count: int, rng: np.random.Generator, device: str, faces: int = 0) -> None:
         boxes: list[ipc.Body] = [
             ipc.AffineBody(f"box{k}", ipc.box_surface((2e-3, 2e-3, 2e-3)), pose=ipc.Pose((5e-3 * k, 0.0, 0.1))) for k in range(2)
         ]
@@ -50,9 +57,11 @@ class Rows:
             *([choose(bonded), choose(soft), *choose(one, 2, False)] for _ in range(5)),
             *([*choose(soft, 4, False)] for _ in range(5)),
         ]
+        own = layout.faces[(layout.vert_body[layout.faces] == 0).all(axis=1)]
+        verts += [[*face, -1] for face in np.repeat(choose(own, faces, False), 2, axis=0)]
         self.verts, n = np.array(verts), len(verts)
         rows = 10 ** rng.uniform(0, 2, (n, 1, 1)) * rng.normal(size=(n, 3, 4)) * (self.verts >= 0)[:, None]
-        concave = np.zeros(n, int)
+        concave = (np.arange(n) >= n - faces).astype(int)
         self._put("row_verts", self.verts)
         self._put("row", rows)
         self._put("concave", concave)
@@ -76,18 +85,30 @@ class Rows:
 
     def product(self, p: np.ndarray) -> np.ndarray:
         """H p, blocks and rows, of all nodes."""
-        pot, device, threads = self.pot, self.world.device, BLOCK if self.world.device.is_cuda else 1
-        x, out = (wp.array(a.reshape(1, -1, 3), dtype=wp.vec3d, device=device) for a in (p, np.zeros_like(p)))
-        lanes = pot.collision.lanes
+        return whole_product(self.pot, p)
 
-        def launch(kernel: Any, chunks: int, inputs: list) -> None:
-            partial = wp.zeros((1, chunks), dtype=wp.float64, device=device)
-            wp.launch(kernel, dim=(1, chunks, threads), inputs=inputs, outputs=[out, partial], device=device, block_dim=BLOCK)
 
-        launch(multiply_blocks, 1, [pot.system, x, pot.everyone, threads])
-        inputs = [pot.system, pot.collision.contacts, x, pot.everyone, lanes, threads]
-        launch(multiply_rows, -(-lanes // BLOCK), inputs)
-        return out.numpy().ravel()
+def whole_product(pot: Potential, p: np.ndarray) -> np.ndarray:
+    """H p of a matrix that has all its blocks, volumes apart, and its contact rows."""
+    device, lanes = pot.device, pot.collision.lanes
+    threads = BLOCK if device.is_cuda else 1
+    x, out = (wp.array(a.reshape(1, -1, 3), dtype=wp.vec3d, device=device) for a in (p, np.zeros_like(p)))
+
+    def launch(kernel: Any, chunks: int, inputs: list) -> None:
+        partial = wp.zeros((1, chunks), dtype=wp.float64, device=device)
+        wp.launch(kernel, dim=(1, chunks, threads), inputs=inputs, outputs=[out, partial], device=device, block_dim=BLOCK)
+
+    launch(multiply_blocks, 1, [pot.system, x, pot.everyone, threads])
+    launch(multiply_rows, -(-lanes // BLOCK), [pot.system, pot.collision.contacts, x, pot.everyone, lanes, threads])
+    return out.numpy().ravel()
+
+
+def half_product(pot: Potential, p: np.ndarray) -> tuple[np.ndarray, float]:
+    """H p by the upper half, and p·H p."""
+    x, out = (wp.array(a.reshape(1, -1, 3), dtype=wp.vec3d, device="cpu") for a in (p, np.zeros_like(p)))
+    total = wp.zeros(1, dtype=wp.float64, device="cpu")
+    wp.launch(multiply_by_half, dim=1, inputs=[pot.system, pot.collision.contacts, x, out, total], device="cpu")
+    return out.numpy().ravel(), float(total.numpy()[0])
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -98,6 +119,53 @@ def test_products_are_those_of_the_rows(device: str, rng: np.random.Generator) -
     rows.pot.collision.contacts.row_count.zero_()
     result, expected = with_rows - rows.product(p), rows.q.T @ (rows.q @ p)
     np.testing.assert_allclose(result, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+@wp.kernel
+def multiply_by_half(system: SystemView, contacts: Contacts, p: VecArray2d, out: VecArray2d, total: FloatArray):
+    env = wp.tid()
+    total[env] = multiply_half(system, contacts, env, p, out)
+
+
+@pytest.mark.parametrize("project", [0, 1])
+def test_products_with_the_upper_half_are_those_with_blocks_and_rows(project: int, rng: np.random.Generator) -> None:
+    """Rows at the nodes of one face are added to blocks, those of affine bodies and of distant nodes are not."""
+    rows = Rows(12, rng, "cpu", faces=6)
+    pot, contacts = rows.pot, rows.pot.collision.contacts
+    pot.project.fill_(project)
+    p = rng.normal(size=rows.q.shape[1]) * np.repeat(rows.layout.node_free, 3)
+    expected = rows.product(p)
+    pot.fold_rows(pot.everyone)
+    is_open = np.zeros(len(rows.verts), bool)
+    is_open[contacts.open_row.numpy()[0, : contacts.open_count.numpy()[0]]] = True
+    assert is_open[:-12].sum() > 20 and not is_open[-12:].any()
+    result, total = half_product(pot, p)
+    np.testing.assert_allclose(result, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+    assert total == pytest.approx(p @ expected, rel=1e-12)
+
+
+def test_products_do_without_the_blocks_that_are_left_out(rng: np.random.Generator) -> None:
+    """A pad alone, whose blocks below the diagonal and of bonded nodes nobody reads; stretched, against the whole matrix."""
+    products, p = [], None
+    for preconditioner in ("block_jacobi", "rest_inverse"):
+        settings = ipc.Settings(dt=0.01, linear_tolerance=1e-6, preconditioner=preconditioner)
+        world = ipc.World([bonded_pad(small_pad((7, 6, 1)))], settings, device="cpu")
+        layout, pot = world.layout, world._newton.potential
+        free = layout.node_free[:, None] * np.ones(3)
+        if p is None:
+            p, stretch = rng.normal(size=free.shape) * free, 2e-5 * rng.normal(size=free.shape) * free
+        pot.set_frames(wp.zeros(1, dtype=wp.float64, device="cpu"), pot.R, pot.t)
+        pot.y.assign(pot.y.numpy() + stretch)
+        pot.place_vertices(pot.y, pot.R, pot.t, pot.x)
+        pot.aim_inertia(pot.R, pot.t)
+        pot.assemble(pot.everyone)
+        pot.fill_matrix(pot.everyone)
+        pot.fold_rows(pot.everyone)
+        assert pot.mirrors == (preconditioner == "rest_inverse")
+        products.append(whole_product(pot, p) if pot.mirrors else half_product(pot, p)[0])
+    whole = products[1]
+    np.testing.assert_allclose(products[0], whole, rtol=0, atol=1e-12 * np.abs(whole).max())
+    assert np.abs(whole.reshape(-1, 3)[layout.node_free != 0]).min() > 0
 
 
 @pytest.mark.parametrize("count", [11, 40])

@@ -107,17 +107,10 @@ class FrictionCorrection:
         loaded = [self._loaded, bound, self._near, self._far]
         self._launch(kernels.load_nodes, each, [s, self._fine, fine, self._nodes, *loaded])
         self._launch(kernels.choose_windows, pads, [self._near, self._far, self._nodes, s])
-        tried = [self._trial.x.numbers, self._trial.y.numbers]
-        moved = [self._moved.x.numbers, self._moved.y.numbers]
-        self._launch(kernels.begin, each, [s, bound, self.traction.x.numbers, self.traction.y.numbers, *tried])
-        for _ in range(_TRIALS):
-            self._respond(self._trial)
-            self._launch(kernels.trial_sums, each, [s, bound, *moved, *tried, self._sums])
-            self._launch(kernels.trial_sizes, pads, [self._sums, s])
-            self._launch(kernels.next_trial, each, [s, bound, *moved, *tried])
-        self._launch(kernels.put, 1, [1, self._go])
+        self._launch(kernels.put, 1, [0, self._go])
+        self._launch(kernels.begin_search, pads, [s, self._go])
         with wp.ScopedDevice(self._products.device):
-            wp.capture_while(self._go, self._iterate)
+            wp.capture_if(self._go, self._search)
         amplitudes = [self.waves.x.numbers, self.waves.y.numbers]
         self._launch(kernels.clear_unsolved, each, [s, *amplitudes])
         self._at_vertices.displacement(self.waves, self._layer, s.chosen)
@@ -126,6 +119,19 @@ class FrictionCorrection:
         layer = [self._layer.x.numbers, self._layer.y.numbers, self._holding.response()]
         blend = [settings.full_blend, settings.no_blend, settings.small_motion]
         self._launch(kernels.blend, pads, [s, normal.touching, normal.load, dragged, *layer, *blend, sideways])
+
+    def _search(self) -> None:
+        """Launch the search for the traction, by fixed points between it and its limits."""
+        s, pads, each, bound = self.contact, len(self._sums), self._sums.shape, self._bound.numbers
+        tried = [self._trial.x.numbers, self._trial.y.numbers]
+        moved = [self._moved.x.numbers, self._moved.y.numbers]
+        self._launch(kernels.begin, each, [s, bound, self.traction.x.numbers, self.traction.y.numbers, *tried])
+        for _ in range(_TRIALS):
+            self._respond(self._trial)
+            self._launch(kernels.trial_sums, each, [s, bound, *moved, *tried, self._sums])
+            self._launch(kernels.trial_sizes, pads, [self._sums, s])
+            self._launch(kernels.next_trial, each, [s, bound, *moved, *tried])
+        wp.capture_while(self._go, self._iterate)
 
     def _iterate(self) -> None:
         """Launch the traction under the present limits, and the motion and the limits that follow."""

@@ -483,6 +483,13 @@ def put(value: wp.int32, flag: wp.array(dtype=wp.int32)):
 
 
 @wp.kernel
+def begin_search(s: Contact, go: wp.array(dtype=wp.int32)):
+    """Search if there is an environment to search, after ``go`` was cleared."""
+    if s.active[wp.tid()] != 0:
+        go[0] = 1
+
+
+@wp.kernel
 def go_on(any_: wp.array2d(dtype=wp.int32), s: Contact, go: wp.array(dtype=wp.int32)):
     env = wp.tid()
     if s.active[env] == 0:

@@ -165,10 +165,10 @@ class NormalCorrection:
         self._launch(kernels.smooth_remainder, each, inputs)
         self.surface.rise_of(self._remainder, self.rise)
         self.products.sandwich(self._rows, self.rise, self._columns, self._spare, self._over)
-        gaps = [self.settings.open_gap, self.settings.clear_gap, self._rest, self._over.numbers, under, self.load]
-        results = [self._overlap.numbers, self._start.numbers, self._near]
-        self._launch(kernels.overlaps, lines, [self.hats, self._wide, *gaps, *results])
+        gaps = [self.settings.open_gap, self.settings.clear_gap, self._rest, self._over.numbers, under]
+        self._launch(kernels.overlaps, lines, [*gaps, self._overlap.numbers, self._near])
         self._launch(kernels.choose_windows, each[0], [sound, clearance, self._near, s])
+        self._launch(kernels.first_pressures, lines, [s, self.hats, self._wide, self.load, self._start.numbers])
         self._launch(kernels.greatest_in_window, each[0], [s, self._start.numbers, self._greatest])
         begun = [self._p.numbers, self._t.numbers, self.pressure.numbers, self._overlapping]
         self._launch(kernels.begin, lines, [s, self._overlap.numbers, self._greatest, self._start.numbers, *begun])

@@ -108,17 +108,15 @@ def smooth_remainder(
 
 @wp.kernel
 def overlaps(
-    hats: Hats, wide: wp.int32, open_gap: wp.float64, clear_gap: wp.float64,
-    rest: wp.array2d(dtype=wp.float64), rise: wp.array3d(dtype=wp.float32), under: wp.array3d(dtype=wp.float64),
-    load: wp.array2d(dtype=wp.float64),
+    open_gap: wp.float64, clear_gap: wp.float64, rest: wp.array2d(dtype=wp.float64), rise: wp.array3d(dtype=wp.float32),
+    under: wp.array3d(dtype=wp.float64),
     # outputs
     overlap: wp.array3d(dtype=wp.float32),
-    pressure: wp.array3d(dtype=wp.float32),
     near: wp.array2d(dtype=wp.vec2i),
 ):  # fmt: skip
-    """Overlap of the coat without normal contact [m], and a pressure to begin with.
+    """Overlap of the coat without normal contact [m], by (environment, row).
 
-    By (environment, row); ``near``: columns, from and to, of the row's nodes that may touch.
+    ``near``: columns, from and to, of the row's nodes that may touch.
     """
     env, row = wp.tid()
     from_, to = rise.shape[2], wp.int32(0)
@@ -130,12 +128,6 @@ def overlaps(
         overlap[env, row, i] = wp.float32(u)
         if u > -clear_gap:
             from_, to = wp.min(from_, i), wp.max(to, i + 1)
-        corner = hats.cell_y[row] * wide + hats.cell_x[i]
-        a, b = hats.share_x[i], hats.share_y[row]
-        one = wp.float64(1.0)
-        p = (one - b) * ((one - a) * load[env, corner] + a * load[env, corner + 1])
-        p += b * ((one - a) * load[env, corner + wide] + a * load[env, corner + wide + 1])
-        pressure[env, row, i] = wp.float32(p * hats.area_x[i] * hats.area_y[row])
     near[env, row] = wp.vec2i(from_, to)
 
 
@@ -166,6 +158,28 @@ def choose_windows(
     s.best[env] = _HUGE
     s.improved[env] = 0
     s.count[env] = 0
+
+
+@wp.kernel
+def first_pressures(
+    s: Search, hats: Hats, wide: wp.int32, load: wp.array2d(dtype=wp.float64),
+    # outputs
+    pressure: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
+    """Pressure to begin with in the window: that of the vertices' load between them.
+
+    By (environment, row).
+    """
+    env, row = wp.tid()
+    if row < s.rows[env][0] or row >= s.rows[env][1]:
+        return
+    for i in range(s.columns[env][0], s.columns[env][1]):
+        corner = hats.cell_y[row] * wide + hats.cell_x[i]
+        a, b = hats.share_x[i], hats.share_y[row]
+        one = wp.float64(1.0)
+        p = (one - b) * ((one - a) * load[env, corner] + a * load[env, corner + 1])
+        p += b * ((one - a) * load[env, corner + wide] + a * load[env, corner + wide + 1])
+        pressure[env, row, i] = wp.float32(p * hats.area_x[i] * hats.area_y[row])
 
 
 @wp.kernel
