@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from raytac.markers.pattern import MarkerPattern
 from raytac.observe import Randomization, randomised_sensor
 from raytac.physics.registry import scene_physics
 from raytac.sensor import TactileSensor
-from raytac.specs import PressRanges, PressScene, SensorSpec, StageSpec, SweepSpec
+from raytac.specs import HeightMap, PressRanges, PressScene, SensorSpec, StageSpec, SweepSpec
 from raytac.specs.toml import in_mm
 
 _DRAWS = 10
@@ -314,7 +314,37 @@ def _sensor_digest(sensor: SensorSpec) -> str:
     plain = replace(sensor, source=None, lights=replace(sensor.lights, source=None))
     if plain.marker_motion is not None and hasattr(plain.marker_motion, "source"):
         plain = replace(plain, marker_motion=replace(plain.marker_motion, source=None))
-    return hashlib.sha256(repr(plain).encode()).hexdigest()
+    return hashlib.sha256(_sensor_text(plain).encode()).hexdigest()
+
+
+_FIRST_DEFAULTS = {
+    "SensorSpec": ("optics", "noise", "marker_motion", "source"),
+    "GelpadSpec": ("bonded", "hysteresis", "relaxation_time", "surface"),
+    "CaseSpec": ("wall", "density"),
+    "CameraSpec": ("distortion", "tilt", "monochrome"),
+    "ResponseSpec": ("shading_red", "shading_green", "shading_blue"),
+    "OpticsSpec": ("shadows",),
+    "NoiseSpec": ("dark_variance", "bright_variance"),
+    "LedSpec": ("glow", "virtual"),
+    "LightsSpec": ("source",),
+    "MarkerMotionSpec": ("punch", "source"),
+}
+"""Optional fields that the digest of a sensor has at their defaults too, by class.
+
+Never add to it: a later field counts only where it is not at its default, so that data sets from before it go on.
+"""
+
+
+def _sensor_text(value: Any) -> str:
+    """``repr`` of a sensor or a part of it, without later fields at their defaults."""
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_sensor_text, value))}{',' if len(value) == 1 else ''})"
+    if not is_dataclass(value) or isinstance(value, HeightMap):
+        return repr(value)
+    name, given = type(value).__name__, [(f, getattr(value, f.name)) for f in fields(value)]
+    first = _FIRST_DEFAULTS.get(name, ())
+    items = [f"{f.name}={_sensor_text(own)}" for f, own in given if f.name in first or own != f.default]
+    return f"{name}({', '.join(items)})"
 
 
 def _object_of(scene: PressScene) -> dict[str, Any]:

@@ -71,7 +71,7 @@ def render_dataset(
 
     Shards that are there are read and compared with their checksums; those that are whole stay. A run that is killed leaves whole
     shards only, and the same call goes on with the others. A plan that differs only in a greater number of presses adds to the folder;
-    a last shard that was not full is rendered again.
+    a last shard that was not full is rendered again. Until its first new shard is rendered, the folder stays as it is.
 
     Args:
         folder: of the data set; made if need be.
@@ -95,14 +95,11 @@ def render_dataset(
     folder = Path(folder)
     with FolderLock(folder):
         store = ShardStore(folder, plan.digest, compress=compress)
-        store.shorter = _check_same(folder, plan, store)
+        store.shorter = _check_same(folder, plan)
         with _write_errors(folder):
             store.clear_partial()
         records = _whole(plan, store, progress, say)
         _check_room(folder, plan, records, say)
-        if store.shorter is not None:
-            with _write_errors(folder):
-                _lengthen(folder, plan, store, records)
         missing = [shard for shard in range(plan.shards) if shard not in records]
         job = RenderJob(plan, device, batch)
         start, done, first = time.perf_counter(), 0, None
@@ -115,7 +112,7 @@ def render_dataset(
                     with _write_errors(folder):
                         if first is None:
                             # Not before something is rendered: a refusal leaves nothing at which a corrected command would stop.
-                            write_description(folder, describe(plan, _ordered(records), None))
+                            _begin(folder, plan, store, records)
                         records[result.shard] = store.write(result)
                     done += len(result.rows)
                     first = first or (time.perf_counter(), done)
@@ -161,22 +158,22 @@ def _whole(plan: DatasetPlan, store: ShardStore, progress: bool, say: Callable[[
     return records
 
 
-def _lengthen(folder: Path, plan: DatasetPlan, store: ShardStore, records: dict[int, ShardRecord]) -> None:
-    """Let the whole shards of fewer presses be of this plan, and then say so in the description.
+def _begin(folder: Path, plan: DatasetPlan, store: ShardStore, records: dict[int, ShardRecord]) -> None:
+    """Describe a data set as not complete, before its first new shard is written.
 
-    In this order a run that is killed between both goes on: shards of either plan are read.
+    Whole shards of fewer presses become its own before that: a run that is killed in between goes on, as shards of either plan are read.
     """
-    for record in records.values():
-        store.stamp(record)
+    if store.shorter is not None:
+        for record in records.values():
+            store.stamp(record)
     write_description(folder, describe(plan, _ordered(records), None))
-    store.shorter = None
 
 
 def _ordered(records: dict[int, ShardRecord]) -> list[ShardRecord]:
     return [records[shard] for shard in sorted(records)]
 
 
-def _check_same(folder: Path, plan: DatasetPlan, store: ShardStore) -> str | None:
+def _check_same(folder: Path, plan: DatasetPlan) -> str | None:
     """Refuse a folder with shards of another plan; a description alone is of an empty run.
 
     Returns the digest of the folder's plan if it differs only in fewer presses.
@@ -196,7 +193,9 @@ def _check_same(folder: Path, plan: DatasetPlan, store: ShardStore) -> str | Non
     if changed == ["count"] and type(old.get("count")) is int:
         if old["count"] < new["count"]:
             return description["plan_sha256"]
-        rule = f"holds {old['count']} presses, more than the {new['count']} asked for: choose another folder, or remove it"
+        there = ShardStore(folder, description["plan_sha256"]).presses()
+        rule = f"is a data set of {old['count']} presses, {there} of them rendered, and cannot shrink to the {new['count']} asked for"
+        rule += ": choose another folder, or remove it"
         raise InputError("out", value=folder, rule=rule)
     differs = ", ".join(changed) or "its version"
     rule = f"holds another data set, which differs in {differs}: choose another folder, or remove it"

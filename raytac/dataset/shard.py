@@ -70,7 +70,25 @@ class ShardStore:
 
     def read(self, shard: int) -> ShardRecord | str:
         """The record of a whole shard; else a text that says what is wrong, or ``missing``."""
-        path, arrays = self._path(shard, "json"), self._path(shard, "npz")
+        record, arrays = self._record(shard), self._path(shard, "npz")
+        if isinstance(record, str) or not record.file:
+            return record
+        try:
+            if arrays.stat().st_size != record.bytes or sha256_of(arrays) != record.sha256:
+                return f"{arrays.name} differs from its checksum"
+        except FileNotFoundError:
+            return f"{arrays.name} is missing"
+        except OSError as error:
+            return f"{arrays.name} cannot be read ({error.strerror})"
+        return record
+
+    def presses(self) -> int:
+        """Number of presses of the shards that are there, by their ``.json`` alone."""
+        records = map(self._record, self.present())
+        return sum(len(record.rows) for record in records if isinstance(record, ShardRecord))
+
+    def _record(self, shard: int) -> ShardRecord | str:
+        path = self._path(shard, "json")
         try:
             kept = json.loads(read_regular(path))
             record = ShardRecord(shard, kept["file"], kept["sha256"], kept["bytes"], kept["rows"], kept["made_by"])
@@ -78,18 +96,11 @@ class ShardStore:
                 return f"{path.name} is of another plan"
             if kept["rows_sha256"] != _rows_digest(record.rows):
                 return f"{path.name} differs from its checksum"
-            _check_record(record, f"{FOLDER}/{arrays.name}")
+            _check_record(record, f"{FOLDER}/{path.stem}.npz")
         except FileNotFoundError:
             return "missing"
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             return f"{path.name} cannot be read ({type(error).__name__})"
-        try:
-            if record.file and (arrays.stat().st_size != record.bytes or sha256_of(arrays) != record.sha256):
-                return f"{arrays.name} differs from its checksum"
-        except FileNotFoundError:
-            return f"{arrays.name} is missing"
-        except OSError as error:
-            return f"{arrays.name} cannot be read ({error.strerror})"
         return record
 
     def present(self) -> list[int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from raytac.dataset import DatasetPlan
 from raytac.dataset.arrays import ARRAYS
 from raytac.errors import InputError, SpecError
-from raytac.specs import PressRanges, SweepSpec, load_press, load_sensor
+from raytac.specs import HeightMap, MarkerMotionSpec, PressRanges, PunchSpec, ResponseSpec, SweepSpec, load_press, load_sensor
 
 
 def test_a_press_does_not_depend_on_count_shards_or_other_ranges(sweep: SweepSpec) -> None:
@@ -99,6 +99,47 @@ def test_the_digest_tells_plans_apart_and_names_no_path(sweep: SweepSpec, tmp_pa
     assert len(digests) == len(changed) and plan.digest not in digests
     mesh = DatasetPlan(replace(sweep, objects=(load_press("mesh"),)))
     assert "/" not in json.dumps(mesh.description) and "gear.stl" in json.dumps(mesh.description)
+
+
+def test_data_sets_of_earlier_versions_go_on(sweep: SweepSpec) -> None:
+    """Digests of sensors as data sets keep them, from raytac before responses had a ``colour_mix``.
+
+    The R1.5 was never fitted; if its file is changed all the same, its data sets are others, and so is its digest.
+    """
+    shipped = load_sensor("gelsight_r15")
+    motion = MarkerMotionSpec(1e7, 2e5, 3e5, 1e-4, 4e5, 0.1, 0.5, 0.8, 0.6, "none", PunchSpec(0.3, 5e-3, 2e4), Path("a.toml"))
+    full = replace(
+        shipped,
+        name="full",
+        gelpad=replace(shipped.gelpad, surface=HeightMap(1e-4 * np.eye(6, 7, 3), (5e-3, 7e-3))),
+        camera=replace(shipped.camera, distortion=(0.01, 0.0, 0.0, 0.0)),
+        response=replace(shipped.response, shading_red=(0.1,), shading_blue=(0.1, 0.2, 0.3)),
+        lights=replace(shipped.lights, leds=shipped.lights.leds[:1]),
+        noise=replace(shipped.noise, dark_variance=(1.0, 2.0, 3.0)),
+        marker_motion=motion,
+    )
+    digests = {
+        "gelsight_r15": "eded16f866041395c1de674717de8cb3918f568989a7eccfbe9c827036143df5",
+        "full": "077d23702245f1315643d2d70d2861e0a6314cfd285387ba16ca2a1b7d2bb49a",
+    }
+    plain = replace(sweep, outputs=("height",), markers=None, resolution=(24, 32), randomization={}, marker_perturbation={})
+    assert DatasetPlan(replace(plain, sensors=(shipped, full))).description["sensors"] == digests
+
+
+def test_a_new_optional_field_of_a_sensor_tells_data_sets_apart_only_where_it_is_used(sweep: SweepSpec) -> None:
+    @dataclass(frozen=True)
+    class Later(ResponseSpec):
+        bloom: float = 0.0
+
+    Later.__name__ = Later.__qualname__ = "ResponseSpec"
+    sensor = sweep.sensors[0]
+    later = Later(**vars(sensor.response))
+    mixed = replace(sensor.response, colour_mix=(0.1, 0.0, 0.0, 0.0, 0.0, 0.0))
+    same, bloom, mix = (
+        DatasetPlan(replace(sweep, sensors=(replace(sensor, response=response),))).digest
+        for response in (later, replace(later, bloom=0.1), mixed)
+    )
+    assert same == DatasetPlan(sweep).digest and len({same, bloom, mix}) == 3
 
 
 def test_shapes_and_bytes_are_those_of_the_arrays(sweep: SweepSpec) -> None:

@@ -121,7 +121,9 @@ def test_more_presses_are_added_to_a_data_set_and_fewer_are_refused(
     assert report.rendered == 2 and report.presses == 6 and (folder / "shards/000001.npz").stat().st_mtime_ns == before
     assert contents(folder) == contents(tmp_path / "at_once")
     assert "000002 has 2 of 4 presses: rendered again" in told and verify_dataset(folder).wrong == {}
-    with pytest.raises(InputError, match="holds 14 presses, more than the 10 asked for: choose another folder"):
+    with pytest.raises(
+        InputError, match="14 presses, 14 of them rendered, and cannot shrink to the 10 asked for: choose another folder"
+    ):
         rendered(DatasetPlan(light(sweep)), folder)
     assert contents(folder) == contents(tmp_path / "at_once")
     with pytest.raises(InputError, match="differs in count, seed: choose another folder"):
@@ -131,20 +133,52 @@ def test_more_presses_are_added_to_a_data_set_and_fewer_are_refused(
 def test_an_addition_that_is_killed_goes_on(
     sweep: SweepSpec, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    longer = DatasetPlan(replace(light(sweep), count=14))
+    longer, render = DatasetPlan(replace(light(sweep), count=14)), ShardRenderer.render
     rendered(longer, tmp_path / "at_once")
     with monkeypatch.context() as patch:
         patch.setattr("raytac.dataset.run.write_description", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             rendered(longer, folder)
     assert json.loads((folder / "dataset.json").read_text())["presses"] == 10
+
+    def killed_at_the_last_shard(renderer: ShardRenderer, shard: int) -> ShardResult:
+        if shard == 3:
+            raise KeyboardInterrupt
+        return render(renderer, shard)
+
     with monkeypatch.context() as patch:
-        patch.setattr(ShardRenderer, "render", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(ShardRenderer, "render", killed_at_the_last_shard)
         with pytest.raises(KeyboardInterrupt):
             rendered(longer, folder)
     said = json.loads((folder / "dataset.json").read_text())
-    assert said["presses"] == 14 and not said["complete"] and set(verify_dataset(folder).wrong) == {2, 3}
-    assert rendered(longer, folder).rendered == 2 and contents(folder) == contents(tmp_path / "at_once")
+    assert said["presses"] == 14 and not said["complete"] and set(verify_dataset(folder).wrong) == {3}
+    with pytest.raises(
+        InputError, match="is a data set of 14 presses, 12 of them rendered, and cannot shrink to the 10 asked for"
+    ):
+        rendered(DatasetPlan(light(sweep)), folder)
+    assert rendered(longer, folder).rendered == 1 and contents(folder) == contents(tmp_path / "at_once")
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt(), BackendError("there is no CUDA device")])
+def test_an_addition_that_ends_before_its_first_new_shard_leaves_the_data_set_as_it_is(
+    sweep: SweepSpec,
+    plan: DatasetPlan,
+    folder: Path,
+    whole: dict[str, bytes],
+    monkeypatch: pytest.MonkeyPatch,
+    stop: BaseException,
+) -> None:
+    """Thus a count that was mistyped can be taken back."""
+
+    def stopped(renderer: ShardRenderer, shard: int) -> ShardResult:
+        raise stop
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ShardRenderer, "render", stopped)
+        with pytest.raises(type(stop)):
+            rendered(DatasetPlan(replace(light(sweep), count=100_000)), folder)
+    assert contents(folder) == whole and verify_dataset(folder).wrong == {}
+    assert rendered(plan, folder).rendered == 0 and contents(folder) == whole
 
 
 def test_a_disk_without_room_for_more_presses_leaves_the_data_set_as_it_is(
