@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -93,18 +94,23 @@ class DatasetArgs(SolverOptions):
         fps = self._checked_fps()
         if self.export is not None:
             check_export(self.export, out, plan.sweep)
-        report = render_dataset(
-            plan,
-            out,
-            engine=self.engine,
-            device=self.device,
-            batch=self.batch,
-            workers=self.workers,
-            address=self.ray_address,
-            compress=self.compress,
-            progress=True,
-            say=logging.getLogger("raytac").info,
-        )
+        try:
+            report = render_dataset(
+                plan,
+                out,
+                engine=self.engine,
+                device=self.device,
+                batch=self.batch,
+                workers=self.workers,
+                address=self.ray_address,
+                compress=self.compress,
+                progress=True,
+                say=logging.getLogger("raytac").info,
+            )
+        except KeyboardInterrupt:
+            text = f"raytac: interrupted; shards that are done stay in {out}, the same command goes on with the others"
+            print(text, file=sys.stderr)
+            return 130
         if self.sheet:
             write_png(out / "sheet.png", contact_sheet(PressDataset(out), self.sheet))
         exported = [] if self.export is None else export_presses(out, self.export, fps=fps, progress=True)

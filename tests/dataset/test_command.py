@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from raytac.cli import main
-from raytac.dataset import PressDataset
+from raytac.dataset import PressDataset, ShardRenderer, ShardResult
 from raytac.io.images import read_png
 from raytac.io.metrics import read_metrics
 
@@ -45,6 +45,27 @@ def test_render_resume_and_verify(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert read_metrics(tmp_path / "data/metrics.json")["rendered.shards"] == 1
     assert main([*asked, "--verify"]) == 0
     assert "2 shards are whole" in capsys.readouterr().out
+
+
+def test_an_interrupted_run_says_what_it_leaves(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "small.toml").write_text(SWEEP)
+    asked = ["dataset", str(tmp_path / "small.toml"), "--out", str(tmp_path / "data"), "--device", "cpu"]
+    small = ["--count", "3", "--shard-size", "2", "--outputs", "height"]
+    render = ShardRenderer.render
+
+    def interrupted(renderer: ShardRenderer, shard: int) -> ShardResult:
+        if shard == 1:
+            raise KeyboardInterrupt
+        return render(renderer, shard)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ShardRenderer, "render", interrupted)
+        assert main([*asked, *small]) == 130
+    assert "raytac: interrupted; shards that are done stay in" in capsys.readouterr().err
+    assert main([*asked, *small]) == 0
+    assert "raytac: 1 of 2 shards are there and whole" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("kind", "name"), [("hdf5", "presses.h5"), ("zarr", "presses.zarr"), ("lerobot", "lerobot")])
