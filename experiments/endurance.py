@@ -239,8 +239,8 @@ def report(out: Path, args: Args, rows: list[list[float]], done: int, spent: flo
 
     table = np.array(rows)
     column = {key: table[:, k] for k, key in enumerate(ROW)}
-    way = table[:, [ROW.index("x_m"), ROW.index("y_m")]] - table[0, [ROW.index("x_m"), ROW.index("y_m")]]
-    column["drift"] = np.linalg.norm(way, axis=1)
+    displacement = table[:, [ROW.index("x_m"), ROW.index("y_m")]] - table[0, [ROW.index("x_m"), ROW.index("y_m")]]
+    column["drift"] = np.linalg.norm(displacement, axis=1)
     sittings = [column["memory_mb"][column["sitting"] == k] for k in np.unique(column["sitting"])]
     growth = [float(memory[-1] - memory[0]) for memory in sittings]
     metrics: dict[str, Metric] = {
@@ -260,8 +260,8 @@ def report(out: Path, args: Args, rows: list[list[float]], done: int, spent: flo
         "endurance.frame_m": float(column["frame_m"].max()),
         "endurance.lifted_least_mm": 1e3 * float(column["lifted_m"].min()),
         "endurance.drift_mm": 1e3 * float(column["drift"][-1]),
-        "endurance.drift_x_mm": 1e3 * float(way[-1, 0]),
-        "endurance.drift_y_mm": 1e3 * float(way[-1, 1]),
+        "endurance.drift_x_mm": 1e3 * float(displacement[-1, 0]),
+        "endurance.drift_y_mm": 1e3 * float(displacement[-1, 1]),
         "endurance.ms_per_step": 1e3 * float(np.median(column["speed_s"])),
         "endurance.memory_mb": float(column["memory_mb"][-1]),
         "endurance.memory_growth_mb": growth[-1],

@@ -5,6 +5,7 @@ docs/guide/robots.md says which, and under what licence.
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import logging
 from collections.abc import Iterator
@@ -18,7 +19,18 @@ import numpy as np
 
 _LINKS: Final = tuple(f"link{i}" for i in range(8))
 _HAND: Final = "hand/hand"
-_SHAPES: Final = frozenset({"", *_LINKS, "link5_upper", "link5_lower", "link7_block", "hand/palm"})
+_PARTS: Final = {
+    "link0": ("column", "plate"),
+    "link1": ("ring",),
+    "link2": ("shell", "cap", "cap_back"),
+    "link3": ("shell", "ring"),
+    "link4": ("shell", "cap", "cap_back"),
+    "link5": ("upper", "lower", "shell", "wrist", "ring"),  # no geom has the plain name
+    "link6": ("shell", "cap"),
+    "link7": ("block", "flange"),
+    "hand/palm": ("shell",),
+}
+_SHAPES: Final = (_PARTS.keys() - {"link5"}) | {f"{name}_{part}" for name, parts in _PARTS.items() for part in parts}
 """Names of the geoms of scenes/robots/panda.xml and of the palm, which meshes replace."""
 _SIGN: Final = "link7_block"
 """Geom by whose name our Panda is recognised, behind a prefix of ``MjSpec.attach``."""
@@ -86,17 +98,48 @@ def robot_looks(model: mujoco.MjModel) -> Looks:
 def panda_meshes() -> tuple[VisualMesh, ...]:
     """Meshes of robosuite, which have colours, else those of gymnasium-robotics, else none.
 
-    Nothing of these packages is run. Both hold the meshes of franka_ros (Apache-2.0).
+    Nothing of these packages is run. Both hold the meshes of franka_ros (Apache-2.0). A package that is installed and whose meshes
+    cannot be read, e.g. another version of it, is passed over, and a warning says why.
     """
-    for read in SOURCES.values():
-        meshes = tuple(read())
-        if meshes and all(mesh.file.is_file() for mesh in meshes):
+    for package in SOURCES:
+        try:
+            meshes = _meshes_of(package)
+        except Exception as error:  # files of another project, and drawing needs none of them
+            reason = " ".join(str(error).split())
+            _LOG.warning("no visual meshes from %s %s: %s: %s", package, _version(package), type(error).__name__, reason)
+            continue
+        if meshes:
             return meshes
     _LOG.info(
         "the Panda is drawn as its collision shapes; its visual meshes come with pip install 'raytac[films]', "
-        "in colour with pip install --no-deps robosuite"
+        "in colour with pip install --no-deps robosuite==1.5.2"
     )
     return ()
+
+
+def _meshes_of(package: str) -> tuple[VisualMesh, ...]:
+    """Meshes of every link and of the hand; none without the package.
+
+    Raises errors of many types for files that cannot be read.
+    """
+    meshes = tuple(SOURCES[package]())
+    if not meshes:
+        return ()
+    missing = {*_LINKS, _HAND} - {mesh.body for mesh in meshes}
+    if missing:
+        raise LookupError(f"no mesh of {', '.join(sorted(missing))}")
+    spec = mujoco.MjSpec()
+    for number, mesh in enumerate(meshes):
+        mesh.add_to(spec, str(number))
+    spec.compile()  # reads every file
+    return meshes
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "of unknown version"
 
 
 def _folder(package: str, *parts: str) -> Path | None:
@@ -108,17 +151,21 @@ def _folder(package: str, *parts: str) -> Path | None:
 
 def _of_robosuite() -> Iterator[VisualMesh]:
     folder = _folder("robosuite", *_SUITE)
-    robot = None if folder is None else folder / "robots" / "panda" / "robot.xml"
-    if folder is None or robot is None or not robot.is_file():
+    if folder is None:
         return
+    robot = folder / "robots" / "panda" / "robot.xml"
     spec = mujoco.MjSpec.from_file(str(robot))
     for link in _LINKS:
-        for geom in spec.body(link).geoms:
+        body = spec.body(link)
+        if body is None:
+            raise LookupError(f"no body {link} in {robot}")
+        for geom in body.geoms:
             if geom.type == mujoco.mjtGeom.mjGEOM_MESH and geom.contype == geom.conaffinity == 0:
                 material = spec.material(geom.material)
                 rgba = geom.rgba if material is None else material.rgba
                 red, green, blue, alpha = (float(value) for value in rgba)
-                yield VisualMesh(link, robot.parent / spec.mesh(geom.meshname).file, (red, green, blue, alpha))
+                file = robot.parent / spec.meshdir / spec.mesh(geom.meshname).file
+                yield VisualMesh(link, file, (red, green, blue, alpha))
     yield VisualMesh(_HAND, folder / "grippers" / "meshes" / "panda_gripper" / "hand_vis.stl", _WHITE)
 
 

@@ -177,10 +177,16 @@ def _with_meshes(world: TactileWorld) -> tuple[mujoco.MjModel, Looks]:
     if spec is None or not looks.meshes:
         return copy(world.model), Looks()
     spec = spec.copy()
-    for number, (_, mesh) in enumerate(looks.meshes):
-        mesh.add_to(spec, f"looks/{number}")
+    added = [f"looks/{number}" for number in range(len(looks.meshes))]
+    for name, (_, mesh) in zip(added, looks.meshes, strict=True):
+        mesh.add_to(spec, name)
+    own = [world.model.mesh(number).name for number in range(world.model.nmesh)]
     try:
-        return spec.compile(), looks
+        drawn = spec.compile()
+        if [drawn.mesh(number).name for number in range(drawn.nmesh)] == own + added:
+            return drawn, looks
+        reason = "the model's compiler drops meshes that no geom uses (discardvisual)"
     except ValueError as error:
-        logging.getLogger("raytac").warning("the robot is drawn as its collision shapes: %s", " ".join(str(error).split()))
-        return copy(world.model), Looks()
+        reason = " ".join(str(error).split())
+    logging.getLogger("raytac").warning("the robot is drawn as its collision shapes: %s", reason)
+    return copy(world.model), Looks()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import mujoco
@@ -97,7 +97,8 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def test_every_shape_of_the_panda_is_replaced_and_nothing_else(package: Path):
     spec = two_finger_panda().spec
-    spec.body("link7").add_geom(name="tool", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(0.01, 0, 0), mass=0.0)
+    for number, name in enumerate(("tool", "")):  # a user's geom need not have a name
+        spec.body("link7").add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(0.01 + 0.001 * number, 0, 0), mass=0.0)
     arms = mujoco.MjSpec()
     arms.option.integrator = spec.option.integrator
     arms.attach(spec, prefix="near/", frame=arms.worldbody.add_frame())
@@ -108,7 +109,8 @@ def test_every_shape_of_the_panda_is_replaced_and_nothing_else(package: Path):
     assert {model.body(body).name for body, _ in seen.meshes} == bodies
     assert len(seen.meshes) == len(bodies)
     own = {geom for geom in range(model.ngeom) if model.body(model.geom_bodyid[geom]).name in bodies}
-    assert set(seen.hidden) == own - {model.geom("near/tool").id}
+    users = {geom for geom in own if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE}
+    assert len(users) == 2 and set(seen.hidden) == own - users
 
 
 def test_another_robot_keeps_its_shapes(package: Path):
@@ -116,14 +118,77 @@ def test_another_robot_keeps_its_shapes(package: Path):
     assert looks.robot_looks(model) == looks.Looks()
 
 
-def test_without_a_package_one_line_says_how_to_get_the_meshes(
-    package: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-):
-    (package / "gymnasium_robotics/envs/assets/kitchen_franka/franka_assets/meshes/visual/link3.stl").unlink()  # not whole: none
+def test_without_a_package_one_line_says_how_to_get_the_meshes(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):
     model = one_sensor_panda().spec.compile()
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    looks.panda_meshes.cache_clear()
     with caplog.at_level("INFO", logger="raytac"):
         assert looks.robot_looks(model) == looks.robot_looks(model) == looks.Looks()
-    assert [record.message for record in caplog.records if "raytac[films]" in record.message] == [caplog.records[0].message]
+    looks.panda_meshes.cache_clear()
+    (line,) = (record.message for record in caplog.records)
+    assert "raytac[films]" in line and "robosuite==1.5.2" in line
+
+
+def robosuite(folder: Path, *, links: Sequence[str] = NAMES[:8], meshdir: str = "", contype: int = 0) -> Path:
+    """Package in the place of robosuite, version 9.8.7, with a box for every link; its robot.xml."""
+    root = folder / "robosuite"
+    robot, hand = root / "models/assets/robots/panda", root / "models/assets/grippers/meshes/panda_gripper"
+    (robot / meshdir).mkdir(parents=True)
+    hand.mkdir(parents=True)
+    (root / "__init__.py").touch()
+    (folder / "robosuite-9.8.7.dist-info").mkdir()
+    (folder / "robosuite-9.8.7.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: robosuite\nVersion: 9.8.7\n")
+    box = trimesh.creation.box(extents=(0.05, 0.05, 0.05))
+    box.export(hand / "hand_vis.stl")
+    for name in links:
+        box.export(robot / meshdir / f"{name}.stl")
+    assets = "".join(f'<mesh name="{name}_vis" file="{name}.stl"/>' for name in links)
+    shape = f'type="mesh" contype="{contype}" conaffinity="0" rgba="0.1 0.2 0.3 1"'
+    bodies = "".join(f'<body name="{name}"><geom {shape} mesh="{name}_vis"/></body>' for name in links)
+    (robot / "robot.xml").write_text(
+        f'<mujoco><compiler meshdir="{meshdir}"/><asset>{assets}</asset><worldbody>{bodies}</worldbody></mujoco>'
+    )
+    importlib.invalidate_caches()
+    return robot / "robot.xml"
+
+
+@pytest.fixture
+def preferred(package: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder of packages, where robosuite is asked before the stand-in of gymnasium-robotics."""
+    monkeypatch.setattr(looks, "SOURCES", {"robosuite": looks._of_robosuite, **looks.SOURCES})
+    return package
+
+
+def test_meshes_lie_in_the_folder_that_the_compiler_names(preferred: Path, caplog: pytest.LogCaptureFixture):
+    robot = robosuite(preferred, meshdir="shells")
+    meshes = looks.panda_meshes()
+    assert not caplog.records and [mesh.body for mesh in meshes] == list(NAMES)
+    assert {mesh.file.parent for mesh in meshes[:8]} == {robot.parent / "shells"}
+    np.testing.assert_allclose([mesh.rgba for mesh in meshes[:8]], np.tile((0.1, 0.2, 0.3, 1.0), (8, 1)), atol=1e-6)
+    np.testing.assert_allclose(meshes[3].surface()[0].max(axis=0), 0.025, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("harm", "reason"),
+    [
+        ("no body", "no body link7"),
+        ("no visual mesh", "no mesh of link0, link1"),
+        ("no robot.xml", "robot.xml"),
+        ("bad robot.xml", "XML"),
+        ("no mesh file", "link3.stl"),
+        ("bad mesh file", "link3"),
+    ],
+)
+def test_a_package_that_cannot_be_read_is_named_and_passed_over(
+    preferred: Path, caplog: pytest.LogCaptureFixture, harm: str, reason: str
+):
+    robot = robosuite(preferred, links=NAMES[: 7 if harm == "no body" else 8], contype=int(harm == "no visual mesh"))
+    target = robot if "robot.xml" in harm else robot.parent / "link3.stl"
+    if harm.endswith((".xml", "file")):
+        target.write_text("<mujoco><nothing") if harm.startswith("bad") else target.unlink()
+    assert {mesh.file.parents[6].name for mesh in looks.panda_meshes()} == {"gymnasium_robotics"}
+    (line,) = (record.message for record in caplog.records)
+    assert "robosuite 9.8.7" in line and reason in line, line
 
 
 def test_the_viewer_shows_the_meshes_on_their_bodies(package: Path):
@@ -177,3 +242,50 @@ assert white(shapes, 0.0, 0.075) and not white(meshes, 0.0, 0.075), "the capsule
 
 def test_a_picture_shows_the_meshes_where_the_links_are(package: Path):
     run_drawing(_SCRIPT.format(package=str(package)))
+
+
+_DISCARDING = """
+import logging, sys
+sys.path.insert(0, {package!r})
+from raytac.robots import looks, one_sensor_panda
+looks.SOURCES.pop("robosuite")
+from raytac.world import SceneCamera, TactileWorld
+
+robot, lines = one_sensor_panda(), []
+spec, handler = robot.spec, logging.Handler()
+handler.emit = lambda record: lines.append(record.getMessage())
+logging.getLogger("raytac").addHandler(handler)
+corners = [x for k in range(8) for x in (0.02 * (k & 1), 0.02 * (k >> 1 & 1), 0.02 * (k >> 2))]
+for name in ("wedge", "unused"):
+    spec.add_mesh(name=name, uservert=corners)
+post = spec.worldbody.add_body(name="post", pos=(0.6, 0.3, 0.1))
+post.add_freejoint()
+post.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="wedge", mass=0.1)
+geom = mujoco.mjtObj.mjOBJ_GEOM
+gel, case, kind = robot.sensors[0].gel, robot.sensors[0].case, mujoco.mjtSensor.mjSENS_GEOMDIST
+spec.add_sensor(type=kind, objtype=geom, objname=gel, reftype=geom, refname=case, cutoff=1.0)  # a gel that is named is kept
+spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+discarding = spec.copy()
+discarding.compiler.discardvisual = True
+
+def drawn(spec):
+    camera = SceneCamera(TactileWorld(spec, sensors=robot.sensors, touches=["post"], outputs=("wrench",)), resolution=(200, 150))
+    picture = camera.draw()
+    camera.close()
+    return picture
+
+meshes = drawn(spec)
+assert not lines, lines
+with_package = drawn(discarding)
+assert len(lines) == 1 and "discardvisual" in lines[0], lines
+looks.panda_meshes.cache_clear()
+looks.SOURCES.clear()
+shapes = drawn(discarding)
+def differ(a, b):  # share of pixels; a renderer's threads change single ones at the edge of a shadow
+    return (np.abs(a.astype(int) - b).max(axis=2) > 8).mean()
+assert differ(with_package, shapes) < 0.01 and differ(meshes, shapes) > 0.05, (differ(with_package, shapes), differ(meshes, shapes))
+"""
+
+
+def test_a_model_that_discards_visual_meshes_is_drawn_by_its_shapes(package: Path):
+    run_drawing(_DISCARDING.format(package=str(package)))
