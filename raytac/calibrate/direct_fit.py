@@ -23,11 +23,12 @@ from raytac.calibrate.light_parameters import (
     DARKEST,
     HEIGHT,
     LENGTH,
-    MOST_MIXED,
     OFF_DIAGONAL,
     REFERENCE_DISTANCE,
     LightParameters,
+    check_mix,
     darkest,
+    least_mix,
     leds_inside,
     mean_power,
     side_ties,
@@ -114,7 +115,12 @@ class DirectFit:
         extra: ExtraLight | None = None,
         seed: int = 0,
     ) -> None:
-        """``factor``² pixels are averaged to one; ``start`` is the prior of lights and imprint."""
+        """``factor``² pixels are averaged to one; ``start`` is the prior of lights and imprint.
+
+        Raises InputError: a colour matrix that is fitted and does not begin inside its bounds.
+        """
+        if "mix" not in settings.fixed:
+            check_mix(sensor, start.p)
         self.sensor, self.shots, self.start, self.settings = sensor, shots, start, settings
         small, coarse = shots.shrunk(factor), shots.shrunk(REST_FACTOR)
         height, width = small.background.shape[:2]
@@ -256,14 +262,22 @@ class DirectFit:
         return FitState(changed, slopes, circles)
 
     def inside_bounds(self, state: FitState) -> FitState:
-        """Every parameter moved to what a sensor accepts (``leds_inside``)."""
+        """Every parameter moved to what a sensor accepts (``leds_inside``).
+
+        LEDs are moved as a whole; of the other blocks, those that are fixed stay.
+        """
         p, response = state.p, state.p.response.copy()
+
+        def bounded(name: str, values: np.ndarray, least: float | np.ndarray, most: float | None) -> np.ndarray:
+            return values if name in self.settings.fixed else np.clip(values, least, most)
+
         length, height = self.sees_sizes()
         leds = leds_inside(self.sensor, p, lengths=length, heights=height)
-        response[0], response[1:4] = np.clip(response[0], 1.0, 2.4), np.clip(response[1:4], 0, DARKEST)
-        a1 = np.clip(response[4], -2.0, 0.5)
-        response[4], response[5] = a1, np.clip(response[5], max(-0.3, -0.75 - a1), 1.5)
-        power, glow, mix = np.maximum(p.power, 0), np.maximum(p.glow, 0), np.clip(p.mix, MOST_MIXED, 0)
+        response[:1], response[1:4] = bounded("gamma", response[:1], 1.0, 2.4), bounded("stray", response[1:4], 0, DARKEST)
+        response[4:5] = bounded("vignette", response[4:5], -2.0, 0.5)
+        response[5:] = bounded("vignette", response[5:], max(-0.3, -0.75 - response[4]), 1.5)
+        power, glow = bounded("power", p.power, 0, None), bounded("glow", p.glow, 0, None)
+        mix = bounded("mix", p.mix, least_mix(self.sensor), 0)
         changed = dataclasses.replace(p, leds=leds, power=power, glow=glow, response=response, mix=mix)
         circles = state.circles.copy()
         circles[:, 2] = np.clip(circles[:, 2], 3, None)

@@ -255,7 +255,8 @@ def with_shading(
 
     ``background`` covers the camera's whole image. Least squares of the logarithm of the quotient, weighted so that residuals are levels
     of the image to first order. ``tracing``: how rays are traced. Raises InputError: more than half of a channel of ``background`` is not
-    brighter than the sensor's black level, or no light reaches a pixel at rest; BackendError: the ray tracer cannot run on ``device``.
+    brighter than the sensor's black level, or a pixel at rest is dark or negative after the colour matrix; BackendError: the ray tracer
+    cannot run on ``device``.
     """
     height, width = background.shape[:2]
     bare = sensor.response.unshaded
@@ -264,7 +265,9 @@ def with_shading(
     layers = tracer.render_layers(GelSurface.at_rest(make_grid(sensor.gelpad, settings.pitch)))
     rest = tracer.response.mixed(total(layers)[0]) * tracer.response.scale
     if not (rest > 0).all():
-        rule = "leave this many values of the image at rest dark, and no gain makes these bright"
+        rule = (
+            "leave this many values of the image at rest dark or negative after the colour matrix, and no gain makes these bright"
+        )
         raise InputError("lights", value=int((rest <= 0).sum()), rule=rule)
     gamma, black = bare.gamma, np.asarray(bare.black_level)
     light = decode(background, gamma)

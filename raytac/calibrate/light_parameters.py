@@ -38,7 +38,9 @@ GAP = 0.02
 """Distance [mm] that an LED's corners keep from the case and the gel."""
 MOST_MIXED = -0.5
 """Least number of a fitted colour matrix off its diagonal (a guess); the most is 0.
-Light of several channels from one LED is in its powers."""
+Both are for light in full scales. Light of several channels from one LED is in its powers."""
+ROUNDED = 1e-3
+"""Most that a matrix may begin beyond these bounds: that of a file is rounded."""
 OFF_DIAGONAL = ~np.eye(3, dtype=bool)
 REFERENCE_DISTANCE = 10e-3
 """Distance [m] at which a power of 1 gives a coat facing the LED full scale."""
@@ -149,6 +151,20 @@ def _mixed_balance(sensor: SensorSpec) -> np.ndarray:
     """White balance of a channel over that of the channel it takes from, (6,) as ``colour_mix``."""
     balance = np.array(sensor.response.white_balance)
     return (balance[:, None] / balance)[OFF_DIAGONAL]
+
+
+def least_mix(sensor: SensorSpec) -> np.ndarray:
+    """Least ``LightParameters.mix`` of a fit, (6,): ``MOST_MIXED``, or −1 in the sensor's file."""
+    return np.maximum(MOST_MIXED, -_mixed_balance(sensor))
+
+
+def check_mix(sensor: SensorSpec, p: LightParameters) -> None:
+    """InputError for a start whose colour matrix lies outside the bounds of a fit of it."""
+    balance, least = _mixed_balance(sensor), least_mix(sensor)
+    if (p.mix < least - ROUNDED).any() or (p.mix > ROUNDED).any():
+        bounds = ", ".join(f"[{number:.4g}, 0]" for number in least / balance)
+        rule = f'must be in {bounds} where a fit of it begins: fix "mix", or begin without a matrix'
+        raise InputError("response.colour_mix", value=tuple(float(f"{m:.4g}") for m in p.mix / balance), rule=rule)
 
 
 def mean_power(p: LightParameters) -> float:

@@ -148,8 +148,8 @@ def fit_lights(
     ``start``: where the fit begins; None is ``first_state``. ``rounds`` of defect correction follow the fit of direct light; 0 leaves it
     at that. Direct light is fitted from ``starts`` places, the given one and others about it, and the best goes on. ``seed`` chooses
     pixels and places. ``tick`` is called with the stage and the cost after every step. Raises InputError: refraction, a camera with
-    distortion, tilt or without colours, LEDs of no colour, or fewer values than parameters; BackendError: the ray tracer cannot run on
-    ``device``.
+    distortion, tilt or without colours, LEDs of no colour, a colour matrix outside its bounds that is not fixed, or fewer values than
+    parameters; BackendError: the ray tracer cannot run on ``device``.
     """
     settings = FitSettings() if settings is None else settings
     if sensor.refraction.model != "none":

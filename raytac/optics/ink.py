@@ -45,7 +45,8 @@ def darkened(sensor: SensorSpec, levels: list[Any], ink: Any) -> list[Any]:
     """Levels (0-255, three channels) of a plain coat with dots, for modes that know no light.
 
     In linear light x = (level / 255)^γ less the black level, a dot returns the share ((1 − s) ρ_dot + s q) / ((1 − s) ρ + s q) of what the
-    coat does; q is what the specular lobe, of weight s, sends to the camera beside a white diffuse coat.
+    coat does; q is what the specular lobe, of weight s, sends to the camera beside a white diffuse coat. Channels are not unmixed first, so
+    that with a colour matrix this is exact only where all channels have the same share, as with grey coats.
     """
     coat, response, s = sensor.coat, sensor.response, sensor.coat.specular
 

@@ -41,11 +41,12 @@ class Response:
         self._mixes = bool((self.matrix != np.eye(3)).any())
 
     def set_flat_field(self, background: np.ndarray, at_rest: np.ndarray) -> None:
-        """Turn radiance ``at_rest`` (H, W, 3) into ``background`` (uint8); InputError where dark."""
+        """Turn radiance ``at_rest`` (H, W, 3) into ``background`` (uint8); InputError if not > 0."""
         at_rest = self.mixed(at_rest)
         dark = int((at_rest <= 0).sum())
         if dark:
-            rule = f"{dark} of {at_rest.size} values rendered at rest are dark, so no gain makes them bright"
+            which = f"{dark} of {at_rest.size} values rendered at rest are dark or negative after the colour matrix"
+            rule = f"{which}, so no gain makes them bright"
             raise InputError("flat_field", value=background.shape, rule=rule)
         target = (background.astype(np.float32) / 255) ** self.spec.gamma - self.black
         if self.monochrome:  # one gain of the mean, so that channels keep their weights
@@ -93,13 +94,15 @@ def _grey(values: np.ndarray) -> np.ndarray:
 def mid_grey_exposure(sensor: SensorSpec, signal: np.ndarray) -> float:
     """Exposure at which the brightest channel's mean at rest is half of full scale.
 
-    e solves max_c mean_p clip(e · s_pc + b_c, 0, 1)^(1/γ) = 1/2 over channels c and pixels p, by bisection: the left side rises with e.
+    e solves max_c mean_p clip(e · s_pc + b_c, 0, 1)^(1/γ) = 1/2 over channels c and pixels p, by bisection. The left side rises with e
+    where no s is negative, or no b positive; otherwise e may be one of several solutions.
 
     Args:
         sensor: its response gives γ and the black level b, and names the file of an error.
-        signal: s, the linear image at rest with vignette, shading and white balance at exposure 1, (H, W, 3).
+        signal: s, the linear image at rest with colour matrix, vignette, shading and white balance at exposure 1, (H, W, 3).
 
-    Raises SpecError: no exposure makes mid-grey, since half of the image or more is dark, or since the black level alone is brighter.
+    Raises SpecError: the image is not darker than mid-grey at the least exposure, as its black level alone is brighter, or not brighter at
+    the largest, as half of it or more is dark or negative after the colour matrix.
     """
     black, gamma = np.asarray(sensor.response.black_level), sensor.response.gamma
     if sensor.camera.monochrome:
@@ -110,7 +113,8 @@ def mid_grey_exposure(sensor: SensorSpec, signal: np.ndarray) -> float:
 
     low, high = np.log(_LIMITS)
     if not brightness(_LIMITS[0]) < 0.5 < brightness(_LIMITS[1]):
-        rule = "no exposure makes the image at rest mid-grey: too much of it is dark, or its black level alone is brighter"
+        why = "too much of it is dark or negative after the colour matrix, or its black level alone is brighter"
+        rule = f"no exposure makes the image at rest mid-grey: {why}"
         raise SpecError(rule, file=sensor.source, key="response.exposure", value=sensor.response.exposure)
     for _ in range(_STEPS):
         middle = 0.5 * (low + high)

@@ -21,6 +21,7 @@ from raytac.report.real_imprints import FITTED, check_imprints, imprint_metrics,
 from raytac.report.real_scores import outliers, press_scores, summary
 from raytac.specs import SensorSpec
 from raytac.specs.press import PADS
+from raytac.specs.sensor import UNMIXED
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ ABLATIONS: dict[str, Ablation] = {
     "no_response_curve": Ablation(
         sensor=lambda s: replace(s, response=replace(s.response, gamma=1.0, black_level=(0.0, 0.0, 0.0))), fixed=("stray",)
     ),
-    "no_colour_matrix": Ablation(fixed=("mix",)),
+    "no_colour_matrix": Ablation(sensor=lambda s: replace(s, response=replace(s.response, colour_mix=UNMIXED)), fixed=("mix",)),
     "one_led_a_colour": Ablation(sensor=_one_a_colour),
     "rigid_pad_imprint": HELD,
     "one_photograph_at_rest": Ablation(settle=False),

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
+from raytac.calibrate.direct_fit import SIGMA, DirectFit, FitSettings, FitState
 from raytac.calibrate.direct_light import ExtraLight, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.light_parameters import HEIGHT, LENGTH, LightParameters, side_ties, with_parameters
@@ -382,3 +382,39 @@ def test_the_prior_that_serves_presses_elsewhere_best_is_chosen(sensor: SensorSp
     assert found == "tied-dark", "by next to nothing: the usual one"
     with pytest.raises(InputError, match="at least 8"):
         choose_strength(start, shots.take(np.arange(7)), settings)
+
+
+def test_a_fitted_colour_matrix_is_one_that_a_sensor_file_takes(sensor: SensorSpec) -> None:
+    """Where red's gain is three times the others': numbers in full scales end where those of the file reach −1, and at −0.5 else."""
+    balanced = dataclasses.replace(sensor, response=dataclasses.replace(sensor.response, white_balance=(3.0, 1.0, 1.0)))
+    shots, true = direct(balanced, circles(2))
+    problem = DirectFit(balanced, shots, true, FitSettings(samples=(60, 40)), factor=4)
+    for mix, written in ((-0.4, (-0.4 / 3, -0.4 / 3, -1, -0.4, -1, -0.4)), (-0.9, (-0.5 / 3, -0.5 / 3, -1, -0.5, -1, -0.5))):
+        beyond = dataclasses.replace(true, p=dataclasses.replace(true.p, mix=np.full(6, mix)))
+        fitted = with_parameters(balanced, problem.inside_bounds(beyond).p, shots.background)
+        assert fitted.response.colour_mix == pytest.approx(written)
+        again = LightParameters.of(fitted, shots.background)
+        np.testing.assert_allclose(again.mix, problem.inside_bounds(beyond).p.mix, rtol=1e-12)
+
+
+def test_fixed_blocks_stay_and_a_start_outside_the_bounds_of_free_ones_is_refused(sensor: SensorSpec) -> None:
+    """A camera whose own matrix adds channels: kept where "mix" is fixed, as circles are refined, and no start of a fit of it."""
+    added = dataclasses.replace(sensor.response, colour_mix=(0.2, 0.0, 0.1, -0.7, 0.0, 0.3), white_balance=(1.2, 0.8, 1.0))
+    own = dataclasses.replace(sensor, response=dataclasses.replace(added, gamma=2.6, vignetting=(0.7, 0.0, 0.0)))
+    shots, true = direct(sensor, circles(2))
+    state = dataclasses.replace(true, p=LightParameters.of(own, shots.background))
+    response = {"gamma": slice(0, 1), "vignette": slice(4, 6)}
+    for fixed in (("mix",), ("gamma", "mix"), ("mix", "vignette"), tuple(SIGMA)):
+        kept = DirectFit(own, shots, state, FitSettings(fixed=fixed, samples=(60, 40)), factor=4).inside_bounds(state)
+        np.testing.assert_array_equal(kept.p.mix, state.p.mix)
+        for name in ("gamma", "vignette"):
+            stays = np.array_equal(kept.p.response[response[name]], state.p.response[response[name]])
+            assert stays == (name in fixed), (name, fixed)
+    written = with_parameters(own, kept.p, shots.background).response
+    assert written.colour_mix == pytest.approx(own.response.colour_mix) and written.gamma == 2.6
+    with pytest.raises(InputError, match=r"response\.colour_mix = .*0\.2.*must be in \[-0\.3333, 0\].*fix \"mix\"") as said:
+        DirectFit(own, shots, state, FitSettings(samples=(60, 40)), factor=4)
+    assert "-0.7" in str(said.value)
+    rounded = dataclasses.replace(true, p=dataclasses.replace(true.p, mix=np.array([-0.50001, 0, 0, 0, 0, 0])))
+    problem = DirectFit(sensor, shots, rounded, FitSettings(samples=(60, 40)), factor=4)
+    assert problem.inside_bounds(rounded).p.mix[0] == -0.5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -27,11 +28,12 @@ from raytac.optics import RayTraced
 from raytac.report.markers import run_calibrate_markers
 from raytac.report.real import real_splits, table_text
 from raytac.report.real_calibration import run_calibrate_optics
-from raytac.report.real_fits import RealSettings
+from raytac.report.real_fits import ABLATIONS, RealSettings
 from raytac.report.real_imprints import imprint_metrics, imprint_table
 from raytac.report.real_scores import noise_floor, outliers, press_rows, press_scores, summary
 from raytac.sensor import TactileSensor
 from raytac.specs import load_sensor
+from raytac.specs.sensor import UNMIXED
 
 CIRCLES = np.array([[120.0, 100.0, 30.0], [200.0, 140.0, 28.0]])
 SENSOR = load_sensor("gelsight_mini")
@@ -400,3 +402,11 @@ def test_a_calibration_of_markers_by_unknown_names_writes_nothing(name: str, sai
     with pytest.raises(InputError, match=name) as told:
         run_calibrate_markers(SENSOR, tmp_path / "out", quick=True, seed=0, start=0.0, **how)
     assert said in str(told.value) and not list(tmp_path.iterdir())
+
+
+def test_the_fit_without_a_colour_matrix_has_none_whatever_the_sensor_has() -> None:
+    response = dataclasses.replace(SENSOR.response, colour_mix=(-0.1,) * 6)
+    own, ablation = dataclasses.replace(SENSOR, response=response), ABLATIONS["no_colour_matrix"]
+    changed = ablation.sensor(own)
+    assert changed == dataclasses.replace(own, response=dataclasses.replace(response, colour_mix=UNMIXED))
+    assert ablation.fixed == ("mix",), "it stays so in the fit"
