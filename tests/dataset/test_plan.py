@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from raytac.dataset import DatasetPlan
 from raytac.dataset.arrays import ARRAYS
 from raytac.errors import InputError, SpecError
-from raytac.specs import HeightMap, MarkerMotionSpec, PressRanges, PunchSpec, ResponseSpec, SweepSpec, load_press, load_sensor
+from raytac.specs import HeightMap, MarkerMotionSpec, PressRanges, ResponseSpec, SweepSpec, load_press, load_sensor
 
 
 def test_a_press_does_not_depend_on_count_shards_or_other_ranges(sweep: SweepSpec) -> None:
@@ -107,7 +107,7 @@ def test_data_sets_of_earlier_versions_go_on(sweep: SweepSpec) -> None:
     The R1.5 was never fitted; if its file is changed all the same, its data sets are others, and so is its digest.
     """
     shipped = load_sensor("gelsight_r15")
-    motion = MarkerMotionSpec(1e7, 2e5, 3e5, 1e-4, 4e5, 0.1, 0.5, 0.8, 0.6, "none", PunchSpec(0.3, 5e-3, 2e4), Path("a.toml"))
+    motion = MarkerMotionSpec(1e7, 2e5, 3e5, 1e-4, 4e5, 0.1, 0.5, 0.8, 0.6, "none", None, Path("a.toml"))
     full = replace(
         shipped,
         name="full",
@@ -120,7 +120,7 @@ def test_data_sets_of_earlier_versions_go_on(sweep: SweepSpec) -> None:
     )
     digests = {
         "gelsight_r15": "eded16f866041395c1de674717de8cb3918f568989a7eccfbe9c827036143df5",
-        "full": "077d23702245f1315643d2d70d2861e0a6314cfd285387ba16ca2a1b7d2bb49a",
+        "full": "e99d845a29e39451cdcbf052ffa0636b367bf8ee344d237f0f27c2824a0cfa94",
     }
     plain = replace(sweep, outputs=("height",), markers=None, resolution=(24, 32), randomization={}, marker_perturbation={})
     assert DatasetPlan(replace(plain, sensors=(shipped, full))).description["sensors"] == digests
