@@ -57,7 +57,8 @@ class Newton:
         nodes, lanes = len(layout.node_rest), potential.collision.lanes
         self.pcg = Pcg(self.batch, nodes, lanes, self.device)
         self.preconditioner = make_preconditioner(layout, settings, self.batch, lanes, self.device)
-        if not self.device.is_cuda and self.pcg.is_in_one_block(self.preconditioner):
+        # A free ball rests on a point: only sums that mirror each other keep it there, and those by halves do not.
+        if not self.device.is_cuda and self.pcg.is_in_one_block(self.preconditioner) and _is_held(layout):
             potential.use_halves()
         self._still = wp.zeros_like(potential.x)
         self._friction = int(potential.collision.friction)

@@ -132,6 +132,7 @@ def test_products_with_the_upper_half_are_those_with_blocks_and_rows(project: in
     """Rows at the nodes of one face are added to blocks, those of affine bodies and of distant nodes are not."""
     rows = Rows(12, rng, "cpu", faces=6)
     pot, contacts = rows.pot, rows.pot.collision.contacts
+    pot.use_halves()
     pot.project.fill_(project)
     p = rng.normal(size=rows.q.shape[1]) * np.repeat(rows.layout.node_free, 3)
     expected = rows.product(p)
