@@ -1,7 +1,8 @@
 """Products with the upper half of the Newton matrix, by one thread an environment.
 
-They are for a CPU, and worlds without free bodies. Each block above the diagonal is read once and multiplies twice. Conjugate gradients would multiply by each contact row
-many times; a row at nodes of one face or edge of a pad fits the pattern of the matrix, and is added to its blocks instead.
+They are for a CPU, and worlds without free bodies. A block above the diagonal is read once and multiplies twice. Conjugate gradients
+would multiply by each contact row many times; a row at nodes of one face or edge of a pad fits the matrix, and is added to its blocks
+instead.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
