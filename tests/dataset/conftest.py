@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import pytest
 
+from raytac.dataset import ShardRenderer, ShardResult
 from raytac.specs import PressRanges, SweepSpec, load_press, load_sensor
 
 
@@ -27,3 +31,18 @@ def sweep() -> SweepSpec:
         randomization={"exposure": 0.1, "noise": 2.0},
         marker_perturbation={"noise_px": 0.2, "dropout": 0.1, "shift": 0.05e-3},
     )
+
+
+@contextmanager
+def interrupted_at(interrupted: int) -> Iterator[None]:
+    """Ctrl-C when a shard is to be rendered."""
+    render = ShardRenderer.render
+
+    def stop(renderer: ShardRenderer, shard: int) -> ShardResult:
+        if shard == interrupted:
+            raise KeyboardInterrupt
+        return render(renderer, shard)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ShardRenderer, "render", stop)
+        yield

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from raytac.cli import main
-from raytac.dataset import PressDataset, ShardRenderer, ShardResult
+from raytac.dataset import PressDataset
 from raytac.io.images import read_png
 from raytac.io.metrics import read_metrics
+from tests.dataset.conftest import interrupted_at
 
 SWEEP = """
 objects = ["sphere"]
@@ -47,21 +48,11 @@ def test_render_resume_and_verify(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "2 shards are whole" in capsys.readouterr().out
 
 
-def test_an_interrupted_run_says_what_it_leaves(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_run_says_what_it_leaves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "small.toml").write_text(SWEEP)
     asked = ["dataset", str(tmp_path / "small.toml"), "--out", str(tmp_path / "data"), "--device", "cpu"]
     small = ["--count", "3", "--shard-size", "2", "--outputs", "height"]
-    render = ShardRenderer.render
-
-    def interrupted(renderer: ShardRenderer, shard: int) -> ShardResult:
-        if shard == 1:
-            raise KeyboardInterrupt
-        return render(renderer, shard)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(ShardRenderer, "render", interrupted)
+    with interrupted_at(1):
         assert main([*asked, *small]) == 130
     assert "raytac: interrupted; shards that are done stay in" in capsys.readouterr().err
     assert main([*asked, *small]) == 0

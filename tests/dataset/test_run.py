@@ -20,6 +20,7 @@ import pytest
 from raytac.dataset import DatasetPlan, RunReport, ShardRenderer, ShardResult, render_dataset, verify_dataset
 from raytac.errors import BackendError, InputError
 from raytac.specs import SweepSpec
+from tests.dataset.conftest import interrupted_at
 
 
 def light(sweep: SweepSpec) -> SweepSpec:
@@ -133,23 +134,15 @@ def test_more_presses_are_added_to_a_data_set_and_fewer_are_refused(
 def test_an_addition_that_is_killed_goes_on(
     sweep: SweepSpec, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    longer, render = DatasetPlan(replace(light(sweep), count=14)), ShardRenderer.render
+    longer = DatasetPlan(replace(light(sweep), count=14))
     rendered(longer, tmp_path / "at_once")
     with monkeypatch.context() as patch:
         patch.setattr("raytac.dataset.run.write_description", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             rendered(longer, folder)
     assert json.loads((folder / "dataset.json").read_text())["presses"] == 10
-
-    def killed_at_the_last_shard(renderer: ShardRenderer, shard: int) -> ShardResult:
-        if shard == 3:
-            raise KeyboardInterrupt
-        return render(renderer, shard)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(ShardRenderer, "render", killed_at_the_last_shard)
-        with pytest.raises(KeyboardInterrupt):
-            rendered(longer, folder)
+    with interrupted_at(3), pytest.raises(KeyboardInterrupt):
+        rendered(longer, folder)
     said = json.loads((folder / "dataset.json").read_text())
     assert said["presses"] == 14 and not said["complete"] and set(verify_dataset(folder).wrong) == {3}
     with pytest.raises(

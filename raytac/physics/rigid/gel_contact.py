@@ -15,7 +15,7 @@ from raytac.physics.rigid.lift_kernels import TOGETHER, Lifts
 from raytac.physics.rigid.load_law import shear_modulus
 from raytac.physics.rigid.motion_kernels import Frames, move_bodies, pair_of_gels
 from raytac.physics.rigid.pierced import BondedFaces
-from raytac.physics.rigid.response_kernels import Response
+from raytac.physics.rigid.response_kernels import Response, mat66d
 from raytac.physics.rigid.row_kernels import read_rows, set_rows, sum_wrenches
 from raytac.physics.rigid.search import PadSearch
 from raytac.physics.rigid.shear_state import ShearState
@@ -151,6 +151,7 @@ class GelContact:
         response.mass = self._zeros((num_envs, nv, nv), wp.float64)
         response.rows = self._zeros((num_envs, world.ROWS * together, nv), wp.float64)
         response.other = self._zeros((num_envs, world.ROWS, nv), wp.float64)
+        response.own = self._zeros((num_envs, together), mat66d)
         response.state = self._zeros((num_envs, nv), wp.float64)
         self.lifts.solves, self.lifts.response = solves, response
 

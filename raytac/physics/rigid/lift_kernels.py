@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from raytac.physics.rigid.response_kernels import Response, add_force, factorise, own_response, vec6d, velocity_by
+from raytac.physics.rigid.response_kernels import Response, add_force, factorise, mat66d, own_response, vec6d, velocity_by
 from raytac.physics.rigid.world_kernels import ROWS, Slots, Steps
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -108,7 +108,7 @@ def settle_contact(slots: Slots, step: wp.float64, lifts: Lifts, i: wp.int32, k:
     slot, greatest = lifts.slot[i, k], wp.float64(0.0)
     pad, body, first = slot[0], slot[1], _ROWS * k
     friction = wp.max(slots.friction[i, pad, body, 0], LEAST_FRICTION)
-    own = own_response(lifts.response, i, first)
+    own = lifts.response.own[i, k] + mat66d()
     before, free, stiff, scale, wanted, give = vec6d(), vec6d(), vec6d(), vec6d(), vec6d(), wp.float64(0.0)
     for m in range(_ROWS):
         before[m] = lifts.force[i, first + m]
@@ -160,6 +160,8 @@ def settle(slots: Slots, step: wp.float64, lifts: Lifts, i: wp.int32, count: wp.
         add_force(lifts.response, i, row, lifts.force[i, row])
     for row in range(_ROWS * count):
         lifts.free[i, row] = lifts.free[i, row] - velocity_by(lifts.response, i, row)
+    for k in range(count):
+        lifts.response.own[i, k] = own_response(lifts.response, i, _ROWS * k)
     # A lone contact waits for no other.
     sweep, sweeps, most = wp.int32(0), wp.where(count == 1, 1, _SWEEPS), wp.where(count == 1, _SWEEPS * _INNER, _INNER)
     while sweep < sweeps:

@@ -44,6 +44,8 @@ class Response:
     """J_g, then Y, (n, 6 K, nv)."""
     other: wp.array3d(dtype=wp.float64)
     """Rows of one other constraint, (n, 6, nv)."""
+    own: wp.array2d(dtype=mat66d)
+    """W between the rows of each contact, (n, K)."""
     state: wp.array2d(dtype=wp.float64)
     """Yᵀ p, (n, nv)."""
 
