@@ -13,6 +13,7 @@ import pytest
 import trimesh
 
 import raytac
+from raytac import learn
 from raytac.cli import COMMANDS, main
 from raytac.io.metrics import read_metrics
 from raytac.specs import load_sensor
@@ -120,6 +121,27 @@ def test_the_overview_is_one_line_a_command_and_fits_a_screen(capsys: pytest.Cap
         with pytest.raises(SystemExit):
             main(args)
         assert word in capsys.readouterr().err
+
+
+def interrupted(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_ctrl_c_says_that_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("raytac.cli.press.run_press", interrupted)
+    assert main(["press", "coin", "--outputs", "height", "--out", str(tmp_path / "out")]) == 130
+    assert capsys.readouterr().err == "raytac: interrupted; nothing written\n"
+
+
+def test_ctrl_c_in_a_training_says_where_it_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(vars(learn), "train_policies", interrupted)  # the real one needs PyTorch
+    assert main(["train", "--out", str(tmp_path)]) == 130
+    kept = f"each training's last checkpoint is kept in {tmp_path}; the same command goes on from there"
+    assert capsys.readouterr().err == f"raytac: interrupted; {kept}\n"
 
 
 @pytest.mark.parametrize("name", COMMANDS)

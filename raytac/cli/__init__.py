@@ -50,7 +50,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code.
 
     0: done; 1: the doctor found the default job broken; 2: wrong input, or a full disk; 130: Ctrl-C; 141: nobody reads the output any
-    more.
+    more. After Ctrl-C it prints what stays, as ``shared.kept_if_interrupted`` says.
     """
     args = sys.argv[1:] if args is None else args
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -77,8 +77,9 @@ def main(args: Sequence[str] | None = None) -> int:
         _drop_output()
         print(f"raytac: error: cannot write ({error})", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
-        print("raytac: interrupted, nothing written", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        kept = "; ".join(getattr(stop, "__notes__", ())) or "nothing written"
+        print(f"raytac: interrupted; {kept}", file=sys.stderr)
         return 130
     finally:
         log.removeHandler(shown)

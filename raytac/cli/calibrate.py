@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from raytac.cli.shared import FitOptions, SolverOptions, named, print_paths
+from raytac.cli.shared import FitOptions, SolverOptions, kept_if_interrupted, named, print_paths
 from raytac.errors import InputError
 from raytac.io.metrics import read_metrics
 from raytac.report.markers import run_calibrate_markers
@@ -78,14 +77,10 @@ class CalibrateArgs(FitOptions, SolverOptions):
             return self._optics(start)
         sensor = load_sensor(self.sensor)
         out = self.folder("calibrate", "markers", sensor.name + ("-quick" if self.quick else ""))
-        try:
+        with kept_if_interrupted(f"finished presses are kept in {out}"):
             written = run_calibrate_markers(
                 sensor, out, level=self.level, quick=self.quick, device=self.device, seed=self.seed, start=start
             )
-        except KeyboardInterrupt:
-            text = f"raytac: interrupted; finished presses are kept in {out}, the same command continues from there"
-            print(text, file=sys.stderr)
-            return 130
         return print_paths(written)
 
     def _refuse_options_of_the_other(self) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-import sys
 import time
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from raytac.cli.shared import SolverOptions, named, print_paths
+from raytac.cli.shared import SolverOptions, kept_if_interrupted, named, print_paths
 from raytac.io.options import parse_names, parse_resolution
 from raytac.report.compare.page import write_comparison
 from raytac.report.compare.run import Comparison, run_comparison
@@ -62,12 +61,9 @@ class CompareArgs(SolverOptions):
         settings = self.settings()
         settings.check()
         self.prepare_warp()
-        try:
+        with kept_if_interrupted(f"finished rows are kept in {out}"):
             so_far = partial(self._write, out=out, start=start)
             written = so_far(run_comparison(settings, out, report=so_far))
-        except KeyboardInterrupt:
-            print(f"raytac: interrupted; finished rows are kept in {out}, the same command continues from there", file=sys.stderr)
-            return 130
         return print_paths(written)
 
     def _write(self, comparison: Comparison, out: Path, start: float) -> list[Path]:

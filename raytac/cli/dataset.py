@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Annotated
 import tyro
 
 from raytac.checks import check_number
-from raytac.cli.shared import SolverOptions, named, print_paths
+from raytac.cli.shared import SolverOptions, kept_if_interrupted, named, print_paths
 from raytac.dataset import (
     ENGINES,
     EXPORTS,
@@ -94,7 +93,7 @@ class DatasetArgs(SolverOptions):
         fps = self._checked_fps()
         if self.export is not None:
             check_export(self.export, out, plan.sweep)
-        try:
+        with kept_if_interrupted(f"finished shards are kept in {out}"):
             report = render_dataset(
                 plan,
                 out,
@@ -107,13 +106,9 @@ class DatasetArgs(SolverOptions):
                 progress=True,
                 say=logging.getLogger("raytac").info,
             )
-        except KeyboardInterrupt:
-            text = f"raytac: interrupted; shards that are done stay in {out}, the same command goes on with the others"
-            print(text, file=sys.stderr)
-            return 130
-        if self.sheet:
-            write_png(out / "sheet.png", contact_sheet(PressDataset(out), self.sheet))
-        exported = [] if self.export is None else export_presses(out, self.export, fps=fps, progress=True)
+            if self.sheet:
+                write_png(out / "sheet.png", contact_sheet(PressDataset(out), self.sheet))
+            exported = [] if self.export is None else export_presses(out, self.export, fps=fps, progress=True)
         metrics = {
             "command": "dataset",
             "sweep": plan.sweep.name,

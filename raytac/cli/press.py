@@ -85,6 +85,10 @@ class PressArgs(ShadowOptions, SolverOptions):
     Sharp edges look smoother with a finer one, as 0.02."""
     noise: bool = False
     """Add the camera's grain to rgb.png, by the [noise] table of the sensor's file."""
+    background: Path | None = None
+    """Photograph of the untouched sensor, of the image's size, on which rgb.png is shown.
+
+    Or a folder of PNG files, from which --seed draws one. frame.exr stays the simulated light."""
     outputs: Annotated[str | None, named(OUTPUTS)] = None
     """Outputs to compute, joined by commas; all if not given. Only raytrace has layers."""
 
@@ -122,7 +126,7 @@ class PressArgs(ShadowOptions, SolverOptions):
         # Presses that differ in physics or optics do not replace each other.
         others = [name for name in (PHYSICS.name_of(physics), self.optics) if name not in ("rigid", "raytrace")]
         out = self.folder("press", "-".join([scene.name, *others]))
-        written = run_press(sensor, scene, out, outputs=outputs, start=start, progress=True)
+        written = run_press(sensor, scene, out, outputs=outputs, start=start, progress=True, background=self.background)
         self._log_result(read_metrics(out / "metrics.json"))
         return print_paths(written)
 

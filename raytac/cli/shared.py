@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -43,6 +44,16 @@ def print_paths(paths: Iterable[Path]) -> int:
     for path in paths:
         print(path)
     return 0
+
+
+@contextmanager
+def kept_if_interrupted(kept: str) -> Iterator[None]:
+    """Let ``main`` print what Ctrl-C in the block leaves, and that the same command goes on."""
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        stop.add_note(f"{kept}; the same command goes on from there")
+        raise
 
 
 def read_data(

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from raytac.cli.shared import print_paths
+from raytac.cli.shared import kept_if_interrupted, print_paths
 from raytac.io.options import DeviceName
 from raytac.learn.settings import PpoSettings
 from raytac.warp_messages import quiet_warp
@@ -38,9 +37,6 @@ class TrainArgs(PpoSettings):
 
         quiet_warp(not self.verbose)
         out = self.out or Path("runs", "train", self.task if self.physics == "rigid" else f"{self.task}_{self.physics}")
-        try:
+        with kept_if_interrupted(f"each training's last checkpoint is kept in {out}"):
             train_policies(settings, out, device=self.device)
-        except KeyboardInterrupt:
-            print("raytac: interrupted; the same command goes on from the last checkpoints", file=sys.stderr)
-            return 130
         return print_paths([out / "metrics.json"])

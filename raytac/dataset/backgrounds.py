@@ -9,17 +9,14 @@ import numpy as np
 
 from raytac.checks import check_seed
 from raytac.errors import InputError
-
-_DARKEST = 4
-"""Least value of the image at rest that a ratio is taken to: below, it is mostly rounding."""
+from raytac.optics.backgrounds import shown_on
 
 
 class RandomBackground:
     """Transform that shows a sample's ``rgb`` on one of several photographs.
 
-    In linear light, the photograph times the ratio of the press to the pad at rest. As a camera encodes light by a power, its exponent
-    cancels: photograph · rgb / rest_rgb in 8-bit values, which saturate as a camera does. ``rest_rgb`` becomes the photograph, so that
-    differences stay differences. A video keeps one photograph.
+    The image becomes photograph · rgb / rest_rgb, which is the same ratio in linear light, and ``rest_rgb`` the photograph, so that
+    differences stay differences. A video keeps one photograph. ``raytac press --background`` shows one press so.
 
     .. code-block:: python
 
@@ -63,7 +60,4 @@ class RandomBackground:
             )
         drawn = np.random.default_rng(None if self._seed is None else (self._seed, int(sample["index"])))
         photograph = self._photographs[drawn.integers(len(self._photographs))]
-        gain = photograph.astype(np.float32) / np.maximum(rest, _DARKEST)
-        shown = np.clip(rgb * gain + np.float32(0.5), 0.0, 255.0).astype(np.uint8)
-        untouched = np.broadcast_to(rgb == rest, rgb.shape)
-        return {**sample, "rgb": np.where(untouched, photograph, shown), "rest_rgb": photograph.copy()}
+        return {**sample, "rgb": shown_on(photograph, rgb, rest), "rest_rgb": photograph.copy()}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from raytac.errors import RaytacError
+from raytac.errors import InputError, RaytacError
 from raytac.frame import TactileFrame
 from raytac.gel.surface import GelSurface
 from raytac.io.arrays import npy_bytes
@@ -17,6 +17,7 @@ from raytac.io.folder import result_folder
 from raytac.io.images import vector_channels, write_exr, write_png
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.markers import MARKERS
+from raytac.optics.backgrounds import draw_photograph, shown_on
 from raytac.sensor import TactileSensor
 from raytac.specs import PressScene, validate_press
 from raytac.specs.sensor import SensorSpec
@@ -33,18 +34,24 @@ def run_press(
     outputs: tuple[str, ...],
     start: float | None = None,
     progress: bool = False,
+    background: Path | None = None,
 ) -> list[Path]:
     """Press ``scene`` into ``sensor`` and write the files that ``outputs`` name, environment 0.
 
     ``start`` is ``time.perf_counter()`` at the beginning of the job (for ``wall_s``), None is now. ``progress``: show the progress of a
-    soft pad. Returns the files written. Nothing in ``out`` changes until everything is computed and written.
+    soft pad. ``background``: photograph of the untouched sensor on which the image is shown, or a folder of some, from which the sensor's
+    seed draws. Returns the files written. Nothing in ``out`` changes until everything is computed and written.
 
     Raises:
         SpecError: the scene does not fit this sensor.
+        InputError: a background that cannot be read, has another size than the image, or would not be seen.
         RaytacError: the press did not settle.
     """
     start = time.perf_counter() if start is None else start
     validate_press(sensor.spec, scene)
+    if background is not None and not ("rgb" in outputs and "rgb" in sensor.outputs):
+        raise InputError("background", value=background, rule="is shown in rgb, which is not among the outputs")
+    drawn = None if background is None else draw_photograph(background, sensor.resolution, sensor.seed)
     with result_folder(out, FILES) as folder:
         began = time.perf_counter()
         rest = sensor.rest()
@@ -52,6 +59,8 @@ def run_press(
         frame = sensor.press(scene, progress=progress)
         if frame.failed[0]:
             raise RaytacError(f"the press {scene.name!r} did not settle, or its state is not finite: nothing is written")
+        if drawn is not None:
+            frame, rest = (one.with_values(rgb=shown_on(drawn[1], one.rgb, rest.rgb)) for one in (frame, rest))
         if "rgb" in outputs and "rgb" in frame.outputs:
             write_png(folder / "rgb.png", frame.rgb[0])
         channels = exr_channels(frame, outputs)
@@ -66,6 +75,7 @@ def run_press(
             np.savez(folder / "markers.npz", **{name: getattr(frame.markers, name)[0] for name in names})
         _write_preview(folder / "preview.png", sensor, scene, frame, rest, outputs)
         metrics = press_metrics(sensor, scene, frame, rest) | {"time.setup_ms": setup_ms}
+        metrics |= {} if drawn is None else {"image.background": drawn[0]}
         write_metrics(folder / "metrics.json", metrics | {"wall_s": time.perf_counter() - start})
         names = sorted(path.name for path in folder.iterdir())
     return [Path(out) / name for name in names]

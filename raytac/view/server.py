@@ -6,7 +6,8 @@ import http
 import ipaddress
 import logging
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from math import dist, hypot, isfinite
 from types import FunctionType, ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Annotated, Any
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 _LOG = logging.getLogger("raytac.view")
+_SOCKETS = logging.getLogger("raytac.view.sockets")
+"""Of websockets, whose lines about every connection are of no use to who looks at a scene."""
+_SOCKETS.setLevel(logging.WARNING)
 _FAULTS = (CloseCode.PROTOCOL_ERROR, CloseCode.INVALID_DATA, CloseCode.MESSAGE_TOO_BIG)
 """Why websockets itself ends a connection whose other end breaks the protocol."""
 
@@ -54,7 +58,7 @@ def guarded_server(host: str, port: int, addresses: PageAddresses) -> ViserServe
             "process_request": _refuse_others(addresses, process_request),
             "create_connection": _checked_connection(lambda uuid: elements.get(uuid)),
             "max_size": LARGEST_PICTURE,
-            "logger": _LOG,
+            "logger": _SOCKETS,
         }
         return websockets.asyncio.server.serve(*args, **{**options, **guards})
 
@@ -68,7 +72,12 @@ def guarded_server(host: str, port: int, addresses: PageAddresses) -> ViserServe
         class Server(viser.ViserServer):
             __init__ = _copied(viser.ViserServer.__init__, infra=_overlaid(infra, WebsockServer=Sockets))  # type: ignore[assignment]
 
-        server = Server(host, port, verbose=False)
+            def stop(self) -> None:
+                with _unprinted():
+                    super().stop()
+
+        with _unprinted():
+            server = Server(host, port, verbose=False)
     except AttributeError as error:
         raise BackendError(f"{_CHANGED} ({error})") from error
     known = getattr(server.gui, "_gui_input_handle_from_uuid", None)
@@ -80,6 +89,19 @@ def guarded_server(host: str, port: int, addresses: PageAddresses) -> ViserServe
 
 
 _CHANGED = "this version of viser cannot be guarded against other web pages: `pip install 'viser==1.1.1'`"
+
+
+@contextmanager
+def _unprinted() -> Iterator[None]:
+    """Without what viser prints of itself; ``raytac view`` prints the address that is allowed."""
+    import rich
+
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
 
 
 def _copied(function: Any, **names: Any) -> Any:
@@ -120,13 +142,13 @@ def _checked_connection(element: Callable[[str], Any]) -> type[ServerConnection]
             try:
                 return checked_message(await super().recv(decode), element)
             except BadMessage as error:
-                _LOG.warning("raytac: viewer: hung up on %s, which sent a bad message: %s", _who(self), error)
+                _LOG.warning("viewer: hung up on %s, which sent a bad message: %s", _who(self), error)
                 await self.close(error.code, "bad message")
                 assert self.protocol.close_exc is not None
                 raise self.protocol.close_exc from error
             except ConnectionClosed as error:
                 if error.sent is not None and error.sent.code in _FAULTS and not error.rcvd_then_sent:
-                    _LOG.warning("raytac: viewer: hung up on %s: %s", _who(self), error.sent.reason)
+                    _LOG.warning("viewer: hung up on %s: %s", _who(self), error.sent.reason)
                 raise
 
     return Checked
@@ -145,12 +167,12 @@ class _OneLine(logging.Filter):
             return False
         error = record.exc_info[1] if record.exc_info else None
         if error is not None:
-            record.msg, record.args = f"raytac: viewer: {record.getMessage()}: {type(error).__name__}: {one_line(str(error))}", ()
+            record.msg, record.args = f"viewer: {record.getMessage()}: {type(error).__name__}: {one_line(str(error))}", ()
             record.exc_info = record.exc_text = None
         return True
 
 
-_LOG.addFilter(_OneLine())
+_SOCKETS.addFilter(_OneLine())
 
 
 LARGEST = 2**16

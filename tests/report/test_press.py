@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from raytac.errors import RaytacError
+from raytac.errors import InputError, RaytacError
 from raytac.frame import OUTPUTS
-from raytac.io.images import read_exr, read_png, write_sheet
+from raytac.io.images import read_exr, read_png, write_png, write_sheet
 from raytac.io.metrics import read_metrics
 from raytac.report.press import run_press
 from raytac.sensor import TactileSensor
@@ -110,9 +110,52 @@ def test_a_failed_environment_writes_nothing(sensor_spec: SensorSpec, scene: Pre
     assert not list(tmp_path.iterdir())
 
 
-def test_sheet_holds_the_pictures_in_order(tmp_path: Path) -> None:
-    from raytac.io.images import write_png
+def test_the_image_is_shown_on_a_photograph_that_the_seed_draws(
+    sensor_spec: SensorSpec, scene: PressScene, tmp_path: Path
+) -> None:
+    folder, grey = tmp_path / "untouched", {"a.png": 60, "b.png": 120, "c.png": 200}
+    folder.mkdir()
+    for name, value in grey.items():
+        write_png(folder / name, np.full((SIZE[1], SIZE[0], 3), value, np.uint8))
+    drawn = set()
+    for seed in (0, 1, 11):
+        sensor = TactileSensor(
+            sensor_spec, optics=Shader(sensor_spec, SIZE), outputs=("rgb",), resolution=SIZE, pitch=0.5e-3, seed=seed
+        )
+        run_press(sensor, scene, tmp_path / "out", outputs=("rgb",), background=folder)
+        name = str(read_metrics(tmp_path / "out" / "metrics.json")["image.background"])
+        drawn.add(name)
+        shown, rest, pressed = read_png(tmp_path / "out" / "rgb.png"), sensor.rest().rgb[0], sensor.press(scene).rgb[0]
+        untouched = rest == pressed
+        assert 0.1 < untouched.mean() < 0.9 and (shown[untouched] == grey[name]).all()
+        ratio = grey[name] * (pressed[~untouched] / np.maximum(rest[~untouched], 4.0))
+        np.testing.assert_allclose(shown[~untouched], np.minimum(ratio, 255.0), atol=0.51)
+    assert len(drawn) == 3
 
+
+@pytest.mark.parametrize(
+    ("background", "outputs", "words"),
+    [
+        ("missing.png", ("rgb",), "missing.png: must exist"),
+        ("empty", ("rgb",), "empty: must be an image file, or a folder with PNG files"),
+        ("text.png", ("rgb",), "text.png: must be readable as an image"),
+        ("small.png", ("rgb",), "small.png: has 32x24 px and the image 64x48: resolution 32x24 renders at its size"),
+        ("small.png", ("height",), "small.png: is shown in rgb, which is not among the outputs"),
+    ],
+)
+def test_a_photograph_that_cannot_be_shown_is_refused_before_the_press(
+    background: str, outputs: tuple[str, ...], words: str, sensor_spec: SensorSpec, scene: PressScene, tmp_path: Path
+) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "text.png").write_text("no image")
+    write_png(tmp_path / "small.png", np.zeros((24, 32, 3), np.uint8))
+    mode = Shader(sensor_spec, SIZE)
+    with pytest.raises(InputError, match=words):
+        run_press(sensor_with(sensor_spec, mode), scene, tmp_path / "out", outputs=outputs, background=tmp_path / background)
+    assert mode.rendered == 0 and not (tmp_path / "out").exists()
+
+
+def test_sheet_holds_the_pictures_in_order(tmp_path: Path) -> None:
     red, blue = np.zeros((4, 6, 3), np.uint8), np.zeros((5, 3, 3), np.uint8)
     red[..., 0], blue[..., 2] = 255, 255
     write_png(tmp_path / "a.png", red)

@@ -6,13 +6,10 @@ A = L Lᵀ is factored in each Newton iteration. By Woodbury's identity
 
     (K_0 + Jᵀ S J)⁻¹ = C − C Jᵀ W J C,      W = (S⁻¹ + J C Jᵀ)⁻¹ = K − K (K + S)⁻¹ K,      K = (J C Jᵀ)⁻¹.
 
-The second form needs no inverse of S, which is not regular where friction is missing. An affine body is 10⁶ times as stiff against strain
-as against motion: its unknowns are Lᵀ x and its rows L⁻¹ q here, for which K = 1; otherwise the difference would be lost to rounding.
-Inverses are computed in double precision by one block of threads an environment (``dense.py``). W itself is not: it is needed for few
-products in a Newton iteration, and three matrices times a vector have less arithmetic than a product of matrices.
-
-An environment with more contact nodes than there is room for is marked as one that does not fit: with part of its contacts the identity is
-of little use.
+The second form needs no inverse of S, which is not regular where friction is missing. Affine bodies have unknowns Lᵀ x and rows L⁻¹ q here
+(``affine_factor.py``), for which K = 1. Inverses are computed in double precision by one block of threads an environment (``dense.py``).
+W itself is not: it is needed for few products in a Newton iteration, and three matrices times a vector have less arithmetic than a product
+of matrices.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -22,16 +19,27 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.arrays import FloatArray2d, FloatArray3d, IntArray, IntArray2d, MatArray2d, SingleArray3d, VecArray2d
+from ipc.arrays import FloatArray2d, IntArray, MatArray2d, SingleArray3d, VecArray2d
 from ipc.contact.contacts import Contacts, mat34d, rows_of
 from ipc.solver.affine_elimination import Elimination, finish_elimination
 from ipc.solver.blocks import wait_for_block
 from ipc.solver.linear import SystemView, row_column
+from ipc.solver.preconditioners.affine_factor import factor_affine, scaled_row
+from ipc.solver.preconditioners.contact_nodes import (
+    Rest,
+    Small,
+    fits,
+    forget_contacts,
+    mark_contacts,
+    mark_full,
+    place_contacts,
+    rest_entry,
+    slot_of,
+)
 from ipc.solver.preconditioners.dense import PANEL, invert
 
 wp.set_module_options({"enable_backward": False})
 
-mat1212d = wp.types.matrix(shape=(12, 12), dtype=wp.float64)
 LANES = 256
 """Threads on CUDA for the small system of an environment; the size of all blocks."""
 _APART = 64
@@ -40,165 +48,12 @@ _ENTRIES = 78
 """Of the upper half of a body's 12 × 12 matrix."""
 
 
-@wp.struct
-class Rest:
-    """K_0⁻¹ between the interface nodes of a bonded body and the nodes of an affine one.
-
-    ``inverse`` holds the matrices of bonded bodies one after the other, row by row; unknown u of part p is entry u − first[p] of a matrix
-    of width[p] that starts at start[p]. ``unknown`` (N,) is a node's first unknown or −1, ``part`` (N,) its matrix. s nodes may touch
-    something, those on bonded surfaces and of affine bodies: ``surface`` (N,) is a node's number among them or −1, ``surface_node`` (s,)
-    the inverse of that. ``affine`` (N,) is a node's number among the affine nodes, body by body, or −1; ``affine_node`` (A,) the inverse.
-    """
-
-    inverse: wp.array(dtype=wp.float32)
-    start: IntArray
-    first: IntArray
-    width: IntArray
-    unknown: IntArray
-    part: IntArray
-    surface: IntArray
-    surface_node: IntArray
-    affine: IntArray
-    affine_node: IntArray
-
-
-@wp.struct
-class Small:
-    """The contact nodes of each environment and their systems; m is the room.
-
-    ``touched``, ``slot`` (B, s): mark of a surface node that touches, and its place among the contact nodes.
-    ``count`` (B,): contact nodes; more than m do not fit.    ``pads`` (B,): those of pads, the first ones.    ``node`` (B, m).
-    ``known`` (B,): pad nodes of which ``k`` is K; −1 after ``node`` has changed.
-    ``s`` (B, 3m, 3m): the upper half of S, zero after the inverse was computed.    ``k`` (B, 3m, 3m): K of pad nodes [N/m].
-    ``inverse`` (B, 3m, 3m): (K + S)⁻¹ [m/N].
-    ``t``, ``force`` (B, 3m): J K_0⁻¹ r [m], on affine nodes L⁻¹ r, later a product; and W t [N].
-    ``root`` (B, A, 4): blocks of an affine node's row of L⁻¹, at the nodes of its body.
-    """
-
-    touched: IntArray2d
-    slot: IntArray2d
-    count: IntArray
-    pads: IntArray
-    node: IntArray2d
-    known: IntArray
-    s: FloatArray3d
-    k: FloatArray3d
-    inverse: FloatArray3d
-    t: FloatArray2d
-    force: FloatArray2d
-    root: wp.array3d(dtype=wp.mat33d)
-
-
-@wp.func
-def rest_entry(rest: Rest, part: wp.int32, u: wp.int32, v: wp.int32) -> wp.float32:
-    """K_0⁻¹ between two unknowns of one part."""
-    return rest.inverse[rest.start[part] + (u - rest.first[part]) * rest.width[part] + v - rest.first[part]]
-
-
-@wp.func
-def fits(small: Small, env: wp.int32) -> wp.bool:
-    """True if there is room for the contact nodes of an environment."""
-    return small.count[env] <= small.node.shape[1]
-
-
-@wp.kernel
-def forget_contacts(active: IntArray, small: Small):
-    env, s = wp.tid()
-    if active[env] == 0:
-        return
-    if s == 0:
-        small.count[env] = 0
-        small.pads[env] = 0
-    small.touched[env, s] = 0
-
-
-@wp.func
-def surface_of_vertex(system: SystemView, rest: Rest, v: wp.int32) -> wp.int32:
-    """Surface number of the only node that vertex v follows, or −1."""
-    if v < 0:
-        return -1
-    if system.verts.count[v] != 1:
-        return -1
-    return rest.surface[system.verts.nodes[v, 0]]
-
-
-@wp.kernel
-def mark_contacts(system: SystemView, contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
-    """Marks the surface nodes that the rows act on."""
-    env, lane = wp.tid()
-    if active[env] == 0:
-        return
-    for r in range(lane, rows_of(contacts, env), lanes):
-        if contacts.concave[env, r] != 0:
-            continue
-        verts, row = contacts.row_verts[env, r], contacts.row[env, r]
-        for k in range(4):
-            v = verts[k]
-            if v >= 0 and wp.length_sq(row_column(row, k)) > wp.float64(0.0):
-                for m in range(system.verts.count[v]):
-                    s = rest.surface[system.verts.nodes[v, m]]
-                    if s >= 0:
-                        small.touched[env, s] = 1
-
-
-@wp.kernel
-def place_contacts(rest: Rest, active: IntArray, small: Small):
-    """Numbers the contact nodes as ``surface_node`` has them, those of pads first."""
-    env, s = wp.tid()
-    if active[env] == 0 or small.touched[env, s] == 0:
-        return
-    wp.atomic_add(small.count, env, 1)
-    if rest.affine[rest.surface_node[s]] < 0:
-        wp.atomic_add(small.pads, env, 1)
-    place = wp.int32(0)
-    for other in range(s):
-        place += small.touched[env, other]
-    small.slot[env, s] = place
-    if place < small.node.shape[1]:
-        if small.node[env, place] != rest.surface_node[s]:
-            small.known[env] = -1
-        small.node[env, place] = rest.surface_node[s]
-
-
-@wp.kernel
-def mark_full(active: IntArray, small: Small, full: IntArray):
-    env = wp.tid()
-    full[env] = 0
-    if active[env] != 0 and not fits(small, env):
-        full[env] = 1
-
-
-@wp.func
-def slot_of(env: wp.int32, rest: Rest, small: Small, first: wp.int32) -> wp.int32:
-    """Place of an affine body's first node among the contact nodes, or −1.
-
-    The other three follow. −1: nothing touches it.
-    """
-    if first >= 0:
-        if small.touched[env, rest.surface[first]] != 0:
-            return small.slot[env, rest.surface[first]]
-    return -1
-
-
 @wp.func
 def add_block(env: wp.int32, small: Small, i: wp.int32, j: wp.int32, q: wp.vec3d, g: wp.vec3d):
     """S += q gᵀ between the unknowns of contact nodes i <= j."""
     for c in range(3):
         for d in range(3):
             wp.atomic_add(small.s, env, 3 * i + c, 3 * j + d, q[c] * g[d])
-
-
-@wp.func
-def scaled_row(g: mat34d, env: wp.int32, rest: Rest, small: Small, first: wp.int32) -> mat34d:
-    """L⁻¹ g of a row at the nodes of the affine body whose first node is ``first``."""
-    scaled = mat34d()
-    for i in range(4):
-        v = wp.vec3d()
-        for j in range(i + 1):
-            v += small.root[env, rest.affine[first] + i, j] * row_column(g, j)
-        for c in range(3):
-            scaled[c, i] = v[c]
-    return scaled
 
 
 @wp.kernel
@@ -270,65 +125,6 @@ def add_bodies(contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32
                 g = contacts.scaled_row[env, r]
                 total += g[i % 3, i / 3] * g[j % 3, j / 3]
         wp.atomic_add(small.s, env, place + i, place + j, total)
-
-
-@wp.kernel
-def factor_affine(rest: Rest, system: SystemView, active: IntArray, small: Small):
-    """L⁻¹ of every affine body, by the first of some threads.
-
-    Where its matrix is not positive definite, that of the mean diagonal of its blocks.
-    """
-    env, body, lane = wp.tid()
-    if active[env] == 0 or lane > 0:
-        return
-    first = 4 * body
-    A = mat1212d()
-    for i in range(4):
-        node = rest.affine_node[first + i]
-        k = system.row_base[node]
-        for _ in range(system.row_length[node]):
-            j = rest.affine[system.col[k]] - first
-            block = system.blocks[env, k]
-            for p in range(3):
-                for q in range(3):
-                    A[3 * i + p, 3 * j + q] = block[p, q]
-            k += system.stride
-    good = wp.bool(True)
-    for j in range(12):
-        d = A[j, j]
-        for n in range(j):
-            d -= A[j, n] * A[j, n]
-        if not (d > wp.float64(0.0)):
-            good = wp.bool(False)
-            d = wp.float64(1.0)
-        d = wp.sqrt(d)
-        A[j, j] = d
-        for i in range(j + 1, 12):
-            e = A[i, j]
-            for n in range(j):
-                e -= A[i, n] * A[j, n]
-            A[i, j] = e / d
-    # L⁻¹ in the place of L.
-    for j in range(12):
-        A[j, j] = wp.float64(1.0) / A[j, j]
-        for i in range(j + 1, 12):
-            e = wp.float64(0.0)
-            for n in range(j, i):
-                e -= A[i, n] * A[n, j]
-            A[i, j] = e / A[i, i]
-    for i in range(4):
-        for j in range(4):
-            block = wp.mat33d()
-            if good:
-                for p in range(3):
-                    for q in range(3):
-                        if 3 * i + p >= 3 * j + q:
-                            block[p, q] = A[3 * i + p, 3 * j + q]
-            elif i == j:
-                node = rest.affine_node[first + i]
-                size = wp.abs(wp.trace(system.blocks[env, system.diagonal[node]])) / wp.float64(3.0)
-                block = (wp.float64(1.0) / wp.sqrt(wp.max(size, wp.float64(1.0e-30)))) * wp.identity(n=3, dtype=wp.float64)
-            small.root[env, first + i, j] = block
 
 
 @wp.func
@@ -455,34 +251,6 @@ def eliminate_where_full(
     env, lane = wp.tid()
     if running[env] != 0 and not fits(small, env):
         finish_elimination(e, inverse, env, lane, threads, r, z)
-
-
-@wp.func
-def scaled_force(rest: Rest, small: Small, env: wp.int32, a: wp.int32, r: VecArray2d) -> wp.vec3d:
-    """L⁻¹ r at affine node a."""
-    f = wp.vec3d()
-    first = 4 * (a / 4)
-    for j in range(a - first + 1):
-        f += small.root[env, a, j] * r[env, rest.affine_node[first + j]]
-    return f
-
-
-@wp.func
-def affine_motion(rest: Rest, small: Small, env: wp.int32, a: wp.int32, r: VecArray2d) -> wp.vec3d:
-    """L⁻ᵀ (L⁻¹ r − W t) at affine node a.
-
-    L⁻¹ r is computed again, since other threads overwrite z, where it stood.
-    """
-    x = wp.vec3d()
-    first = 4 * (a / 4)
-    s = rest.surface[rest.affine_node[first]]
-    for i in range(a - first, 4):
-        f = scaled_force(rest, small, env, first + i, r)
-        if small.count[env] > 0 and small.touched[env, s] != 0:  # none are left where the inverse could not be computed
-            k = 3 * (small.slot[env, s] + i)
-            f -= wp.vec3d(small.force[env, k], small.force[env, k + 1], small.force[env, k + 2])
-        x += wp.transpose(small.root[env, first + i, a - first]) * f
-    return x
 
 
 def even(room: int) -> int:

@@ -24,18 +24,9 @@ from ipc.solver.affine_elimination import affine_nodes
 from ipc.solver.block_jacobi import BlockJacobi
 from ipc.solver.blocks import THREADS as BLOCK_THREADS
 from ipc.solver.linear import SystemView
-from ipc.solver.preconditioners.low_rank import (
-    LANES,
-    LowRank,
-    Rest,
-    Small,
-    affine_motion,
-    eliminate_where_full,
-    fits,
-    rest_entry,
-    scaled_force,
-    sum_of_parts,
-)
+from ipc.solver.preconditioners.affine_factor import affine_motion, scaled_force
+from ipc.solver.preconditioners.contact_nodes import Rest, Small, fits, rest_entry
+from ipc.solver.preconditioners.low_rank import LANES, LowRank, eliminate_where_full, sum_of_parts
 from ipc.solver.preconditioners.rest_stiffness import bonded_bodies, rest_blocks
 from ipc.solver.preconditioners.substructure import Patch, choose_partition, condense
 

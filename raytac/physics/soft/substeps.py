@@ -64,16 +64,14 @@ class Substeps:
         """Parts (B,) of a step of ``dt`` (B,) [s] that may be made next, and whom to refuse.
 
         The environments to refuse come with the pair that moves too far. Parts are counted in ``limits.most``-ths of the step, as is
-        ``done`` (B,). They are powers of two that divide ``done``; 0 where the step is done, or failed. Free bodies are never refused (a
-        beam may snap back): the solver resolves them, in the smallest parts.
+        ``done`` (B,). They are powers of two that divide ``done``; 0 where the step is done, or failed. What free bodies do, and soft ones
+        by themselves, is never refused (a beam that is held at its foot may snap back): the solver resolves it, in the smallest parts.
         """
         most, waits = self.limits.most, (done < self.limits.most) & ~self._query.failed
         if not waits.any():
             return np.zeros_like(done), {}
         motions = self.motions(now, goal, dt * (1.0 - done / most))
-        driven = {
-            name: motion if self._is_driven(name) else replace(motion, end=motion.start) for name, motion in motions.items()
-        }
+        driven = {name: replace(motion, end=self._driven_end(name, motion, goal)) for name, motion in motions.items()}
         room, pairs = self._room(done, motions, driven)
         if (waits & (room < 1.0)).any():
             room = np.where((room < 1.0) & (self._room(done, driven, driven)[0] >= 1.0), 1.0, room)
@@ -92,8 +90,12 @@ class Substeps:
         )
         return InputError("world_from_pad", value=f"displacements of up to {now.longest(goal, b) * 1e3:.3g} mm", rule=rule)
 
-    def _is_driven(self, name: str) -> bool:
-        return name in self._pads or self._bodies[name].is_driven
+    def _driven_end(self, name: str, motion: BoxMotion, goal: Poses) -> np.ndarray:
+        """Poses (B, 4, 4) where a body is driven to, which for a free one is where it is."""
+        body = self._bodies.get(name)
+        if body is None or (body.is_driven and not isinstance(body.solid, ipc.SoftBody)):
+            return motion.end
+        return np.where(self._query.failed[:, None, None], motion.start, goal.bodies[name]) if body.is_driven else motion.start
 
     def _room(
         self, done: np.ndarray, motions: Mapping[str, BoxMotion], driven: Mapping[str, BoxMotion]
