@@ -94,6 +94,7 @@ class Collision:
         self.surface.plane_pair = self._ints([np.full(n, index) for n, (index, _, _) in zip(counts, plane_pairs, strict=True)])
         self.surface.d_hat = self.d_hat
         self.vert_body = wp.array(layout.vert_body, dtype=wp.int32, device=self.device)
+        self._vert_start = wp.array(layout.vert_start, dtype=wp.int32, device=self.device)
 
     def _make_searches(self, layout: Layout, mesh_pairs: list[tuple[int, int, int]]) -> None:
         """Lists of primitives, and the searches between them.
@@ -370,26 +371,34 @@ class Collision:
         turning = self._turning
         turning.x, turning.y, (turning.frame_q, turning.frame_p), (turning.goal_q, turning.goal_p) = x, y, frames, goals
 
-    def lag(self, relags: wp.array, active: wp.array, changed: wp.array, sum_changed: wp.array) -> None:
+    def lag(self, relags: wp.array, active: wp.array, changes: tuple[wp.array, wp.array, wp.array], guarded: bool) -> None:
         """Freeze active contacts for friction.
 
         Args:
             relags: −1 at the start of a step (B,).
             active: mask (B,).
-            changed, sum_changed: become the relative change of the limits μ λ n at the vertices, and of their sum (B,).
+            changes: become the relative changes of the limits μ λ n at all vertices, at those of the body where it is largest, and of
+                their sum, (B,) each.
+            guarded: True where :meth:`guard_slips` is called after Newton steps.
         """
+        changed, worst_changed, sum_changed = changes
         self._launch(friction.turns_ahead, self._turning.turn.shape, [self._turning, active], [self._turning.turn])
         limits, vertices = self.lagged.limit.shape, self._change.shape
         self._launch(friction.keep_lagged, limits, [self.lagged, active], [self._old])
         self._fill_index(self.memory, active)
         inputs = [self._turning, self.contacts, self.memory, self._index, self.pair_mu, self.d_hat, relags, active]
         self._launch(friction.lag_contacts, limits, inputs, [self.lagged])
-        self._launch(friction.clear_change, vertices, [active], [self._change, self._force, changed])
+        if guarded:
+            self._fill_index(self._old, active)
+            self._launch(friction.carry_guards, limits, [self._old, self._index, relags, active], [self.lagged])
+        self._launch(friction.clear_change, vertices, [active], [self._change, self._force, changed, worst_changed])
         for lagged, sign in ((self.lagged, 1.0), (self._old, -1.0)):
             self._each(friction.lag_difference, [lagged, sign, active], [self._change, self._force])
         self._launch(friction.size_of_change, vertices, [self._change, active], [self._change_size])
         self._reduce(self._change_size, active, SUM, changed)
         self._launch(friction.share_of_change, self.batch, [self._force, active], [changed, sum_changed])
+        inputs = [self.lagged, self._change_size, self._vert_start, self.vert_body, active]
+        self._launch(friction.worst_share, (self.batch, len(self._vert_start) - 1), inputs, [worst_changed])
 
     def guard_slips(self, x: wp.array, dx: wp.array, start: wp.array, active: wp.array, halt: wp.array) -> None:
         """Choose the curvature of friction after a Newton step dx from x (B, V), in the mask (B,).

@@ -390,6 +390,20 @@ def lag_contacts(
 
 
 @wp.kernel
+def carry_guards(old: Lagged, index: Index, relags: IntArray, active: IntArray, out: Lagged):
+    """Let pairs keep their guard where friction is renewed.
+
+    A step begins without, ``relags`` being −1.
+    """
+    env, i = wp.tid()
+    if active[env] == 0 or relags[env] < 0 or i >= out.count[env]:
+        return
+    entry = find_pair(index, old.verts, old.pair, env, out.verts[env, i], out.pair[env, i])
+    if entry >= 0:
+        out.guard[env, i] = old.guard[env, entry]
+
+
+@wp.kernel
 def remember(
     x: VecArray2d,
     turning: Turning,
@@ -551,8 +565,8 @@ def lag_difference(lagged: Lagged, sign: wp.float64, active: IntArray, lanes: wp
 
 
 @wp.kernel
-def clear_change(active: IntArray, change: VecArray2d, force: FloatArray2d, changed: FloatArray):
-    """Set the sums of ``lag_difference`` to 0."""
+def clear_change(active: IntArray, change: VecArray2d, force: FloatArray2d, changed: FloatArray, worst: FloatArray):
+    """Set the sums of ``lag_difference``, and what is made of them, to 0."""
     env, v = wp.tid()
     if active[env] == 0:
         return
@@ -561,6 +575,7 @@ def clear_change(active: IntArray, change: VecArray2d, force: FloatArray2d, chan
         force[env, 0] = wp.float64(0.0)
         force[env, 1] = wp.float64(0.0)
         changed[env] = wp.float64(0.0)
+        worst[env] = wp.float64(0.0)
 
 
 @wp.kernel
@@ -579,3 +594,32 @@ def share_of_change(force: FloatArray2d, active: IntArray, changed: FloatArray, 
         total = wp.max(force[env, 1], wp.float64(1.0e-300))
         changed[env] = changed[env] / total
         sum_changed[env] = wp.abs(force[env, 1] - force[env, 0]) / total
+
+
+@wp.kernel
+def worst_share(
+    lagged: Lagged,
+    change: FloatArray2d,
+    vert_start: IntArray,
+    vert_body: IntArray,
+    active: IntArray,
+    # outputs
+    worst: FloatArray,
+):
+    """Raise ``worst`` to the largest relative change of the forces on one body.
+
+    ``change`` has the lengths of the changes at vertices [N] (``size_of_change``); a body's vertices begin at ``vert_start``.
+    """
+    env, body = wp.tid()
+    if active[env] == 0:
+        return
+    size, total = wp.float64(0.0), wp.float64(0.0)
+    for v in range(vert_start[body], vert_start[body + 1]):
+        size += change[env, v]
+    if size == wp.float64(0.0):
+        return
+    for i in range(wp.min(lagged.count[env], lagged.limit.shape[1])):
+        first, last = lagged.verts[env, i][0], lagged.verts[env, i][3]
+        if vert_body[first] == body or vert_body[wp.max(last, 0)] == wp.where(last < 0, -1, body):
+            total += lagged.limit[env, i]
+    wp.atomic_max(worst, env, size / wp.max(total, wp.float64(1.0e-300)))

@@ -106,7 +106,8 @@ def after_lag(tolerance: wp.float64, max_relags: wp.int32, d: Decisions, f: Flag
         return
     f.settled[0] = 1
     # Renewed where it was only calm, friction of a light body may be off by more than a share of the sum of all forces says.
-    if d.relags[env] > 0 or (d.relags[env] == 0 and d.renewed[env] == 0):
+    # So the forces on every body have to hold, or another solve has to show it.
+    if d.relags[env] > 0 or (d.relags[env] == 0 and (d.renewed[env] == 0 or d.worst_changed[env] <= tolerance)):
         if d.changed[env] <= tolerance or (2 * d.relags[env] >= max_relags and d.sum_changed[env] <= tolerance):
             return
     if d.relags[env] >= max_relags:

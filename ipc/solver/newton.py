@@ -43,7 +43,7 @@ from ipc.solver.step_state import StepState
 
 _RENEWALS = 20
 """Most renewals of friction within a step's first solve, where every body is held."""
-_CALM, _CALM_RENEWALS = 4.0, 4
+_CALM, _CALM_RENEWALS = 20.0, 6
 """Longest Newton step [ε] before a renewal where a body is free, and most of these."""
 
 
@@ -266,7 +266,8 @@ class Newton:
         with self._stage("lag"):
             state.launch(decisions.choose_lagging)
             d = state.decisions
-            pot.collision.lag(d.relags, d.lagging, d.changed, d.sum_changed)
+            changes = d.changed, d.worst_changed, d.sum_changed
+            pot.collision.lag(d.relags, d.lagging, changes, guarded=self._calm_renewals > 0)
             state.launch(decisions.after_lag, self.settings.friction_tolerance, self.settings.friction_relags)
             wp.capture_if(state.flags.average, pot.collision.average, share=d.share, active=d.averaging)
             wp.capture_if(state.flags.settled, pot.collision.undo_lag, active=d.settled)

@@ -65,6 +65,7 @@ class Decisions:
     floor: FloatArray  # gap that has to stay
     changed: FloatArray  # share of the friction forces that the last lag changed
     last_changed: FloatArray  # and the one before
+    worst_changed: FloatArray  # share of the friction forces on a body that the last lag changed, of the body where it is largest
     sum_changed: FloatArray  # by how much the last lag changed the sum of the limits, as a share of it
     share: FloatArray  # of the last lag in the friction forces, the rest being those before it
     averaging: IntArray  # that share is not 1

@@ -265,9 +265,9 @@ def squeezed_box(**settings: object) -> tuple[np.ndarray, int]:
 
 
 def test_partial_slip_under_a_free_body_takes_few_iterations_and_is_not_inexact() -> None:
-    """Pairs near their kink jump to and fro without the majoriser, and what is solved before friction is known is solved in vain."""
+    """Pairs near their kink jump to and fro without the majoriser, which renewals keep; what precedes them is solved in vain."""
     forces, iterations = squeezed_box()
     exact, _ = squeezed_box(friction_tolerance=1e-4, velocity_tolerance=1e-6)
     assert 0.1 < np.hypot(*forces[-1, :2]) / forces[-1, 2] < 0.9 * MU  # some pairs stick, some slip
     np.testing.assert_allclose(forces, exact, rtol=0, atol=2e-3 * forces[-1, 2])
-    assert iterations < 280
+    assert iterations < 200
