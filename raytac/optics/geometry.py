@@ -1,4 +1,4 @@
-"""Geometry below all optical modes: the coat's height field, camera rays, normals, shadows.
+"""Geometry below all optical modes: the coat's height field, camera rays, normals.
 
 The reference integrator traces the triangles of this surface. The fast one needs no acceleration structure for it: the surface is
 a height field over a regular grid, camera rays are near the grid's normal and shadow rays leave the thin slab of the imprint after
@@ -19,8 +19,8 @@ from raytac.gel.surface import GelSurface, PadGrid
 from raytac.optics.camera import Pinhole
 
 TILE = 0.5e-3
-"""Edge of a tile of the bounds map [m]; the bound on the indentation holds one edge.
-Bounds on z hold two: a camera ray of slope t may be that over t off its tile's height, 2.8 mm for the Mini's steepest ray."""
+"""Edge of a tile of the bounds map [m].
+Its bounds hold two beyond: a camera ray of slope t may be that over t off its tile's height, 2.8 mm for the Mini's steepest ray."""
 LOOK_UP_Z = -1.0e-3
 """Height at which a camera ray looks up its tile [m]: between rest and a deep press."""
 _TALL = 2.5e-3
@@ -50,10 +50,13 @@ class NodeGrid:
 
     def cell(self, mi: Any, env: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
         """First corner of the cell under (x, y) [m], and the shares of its sides at that place."""
-        fx = dr.clip((x - self.x0) / self.dx, 0, self.nx - 1.001)
-        fy = dr.clip((y - self.y0) / self.dy, 0, self.ny - 1.001)
+        return self.cell_at(mi, env, (x - self.x0) * (1 / self.dx), (y - self.y0) * (1 / self.dy))
+
+    def cell_at(self, mi: Any, env: Any, fx: Any, fy: Any) -> tuple[Any, Any, Any]:
+        """The same of a place in columns and rows from the first node."""
+        fx, fy = dr.clip(fx, 0, self.nx - 1.001), dr.clip(fy, 0, self.ny - 1.001)
         ix, iy = mi.UInt32(fx), mi.UInt32(fy)
-        return (env * self.ny + iy) * self.nx + ix, fx - mi.Float(ix), fy - mi.Float(iy)
+        return env * (self.ny * self.nx) + (iy * self.nx + ix), fx - mi.Float(ix), fy - mi.Float(iy)
 
     def corners(self, kind: Any, values: Any, i: Any) -> list[Any]:
         """``values``, packets of type ``kind``, at the corners of the cells that start at ``i``."""
@@ -143,9 +146,8 @@ class CoatField:
         self.mi, self.layout, self.rest, self.height = mi, layout, rest, height
         self.nodes, self.cells = dr.ravel(pack_nodes(mi, layout, height)), dr.ravel(pack_cells(mi, layout, height))
         dr.eval(self.nodes, self.cells)
-        self.lowest, self.highest, self.deepest = bounds_map(mi, layout, rest, height)
-        self.pad_deepest = dr.block_reduce(dr.ReduceOp.Max, self.deepest, layout.tiles_x * layout.tiles_y)
-        dr.eval(self.lowest, self.highest, self.deepest, self.pad_deepest)
+        self.lowest, self.highest = bounds_map(mi, layout, height)
+        dr.eval(self.lowest, self.highest)
 
     def _pad_bounds(self) -> tuple[Any, Any]:
         """Lowest and highest z of every pad [m], (B,) each."""
@@ -158,11 +160,15 @@ class CoatField:
     def memory_per_env(layout: CoatLayout) -> int:
         """Bytes of one surface: normals and corners of every node, and the tiles' bounds."""
         g = layout
-        return 32 * g.nx * g.ny + 12 * g.ny * g.tiles_x + 24 * g.tiles_x * g.tiles_y
+        return 32 * g.nx * g.ny + 8 * g.ny * g.tiles_x + 16 * g.tiles_x * g.tiles_y
 
     def z(self, env: Any, x: Any, y: Any, active: Any = True) -> Any:
         """Bilinear height [m] at (x, y) [m]."""
-        i, wx, wy = self.layout.cell(self.mi, env, x, y)
+        return self.z_in(self.layout.cell(self.mi, env, x, y), active)
+
+    def z_in(self, cell: tuple[Any, Any, Any], active: Any = True) -> Any:
+        """Bilinear height [m] in a cell, as ``NodeGrid.cell`` gives it."""
+        i, wx, wy = cell
         c = dr.gather(self.mi.Vector4f, self.cells, i, active)
         return bilinear((c.x, c.y, c.z, c.w), wx, wy)
 
@@ -219,48 +225,6 @@ class CoatField:
         z = za + (zb - za) * dr.clip(ga / dr.maximum(ga - gb, 1e-12), 0, 1)
         return mi.Point3f(ox + (z - oz) * tx, oy + (z - oz) * ty, z)
 
-    def visibility(self, env: Any, p: Any, light: Any, tan_half: Any, active: Any) -> Any:
-        """Share of an emitter at ``light`` seen from ``p`` past the surface itself, in [0, 1].
-
-        Walks the shadow ray cell by cell and keeps the smallest clearance angle. ``tan_half`` is half the emitter's extent seen
-        from ``p`` across the ray in the vertical plane: between −tan_half and +tan_half the share grows linearly, which is exact for
-        a rectangle cut by a straight horizon. ``rest`` is concave, so the ray's clearance from it grows at least linearly from p to the
-        light, and only indentation deeper than that can block the ray. Where the bounds of the tile under the ray (its 3 × 3 neighbourhood)
-        rule that out, the walk skips a whole tile; where the deepest point of the pad does, it ends.
-        """
-        mi, g = self.mi, self.layout
-        d = light - p
-        reach = dr.sqrt(d.x * d.x + d.y * d.y)
-        ux, uy, rise = d.x / reach, d.y / reach, -d.z / reach
-        # Clearance of the ray's lower edge above the resting surface: at least above_p + gain · s, which the coat must exceed to block.
-        above_p = self._rest(p.x, p.y) - p.z
-        gain = (self._rest(light.x, light.y) - light.z - above_p) / reach - tan_half
-        overall = dr.gather(mi.Float, self.pad_deepest, env, active)
-        end = dr.minimum(dr.select(gain > 0, (overall - above_p) / gain, reach), reach)
-        step, edge = min(g.dx, g.dy), min(g.tile_x * g.dx, g.tile_y * g.dy)
-
-        def inside(s: Any, least: Any) -> Any:
-            return active & (s < end) & (least > -tan_half)
-
-        def walk(s: Any, least: Any) -> tuple[Any, Any]:
-            x, y = p.x + s * ux, p.y + s * uy
-            bound = dr.gather(mi.Float, self.deepest, self.tile(env, x, y))
-            is_clear = above_p + dr.minimum(gain * s, gain * (s + edge)) > bound
-            clearance = self.z(env, x, y, ~is_clear) - (p.z - s * rise)
-            least = dr.select(is_clear, least, dr.minimum(least, clearance / s))
-            return s + dr.select(is_clear, edge, step), least
-
-        # Nothing in the way means a clearance of tan_half or more; a start of 1 would shade what lies right under an LED.
-        _, least = dr.while_loop((mi.Float(step), mi.Float(tan_half)), inside, walk, label="shadow ray")
-        return dr.clip(0.5 + 0.5 * least / tan_half, 0, 1)
-
-    def _rest(self, x: Any, y: Any) -> Any:
-        """z of ``rest`` [m] at the node nearest to (x, y)."""
-        mi, g = self.mi, self.layout
-        ix = mi.UInt32(dr.clip((x - g.x0) / g.dx + 0.5, 0, g.nx - 1))
-        iy = mi.UInt32(dr.clip((y - g.y0) / g.dy + 0.5, 0, g.ny - 1))
-        return dr.gather(mi.Float, self.rest, iy * g.nx + ix)
-
 
 def pack_nodes(mi: Any, g: CoatLayout, height: Any) -> Any:
     """(z, n_x, n_y, n_z) at nodes of ``height`` (B·Ny·Nx); one-sided differences on the rim."""
@@ -278,39 +242,33 @@ def pack_cells(mi: Any, g: CoatLayout, height: Any) -> Any:
     return mi.Vector4f([dr.gather(mi.Float, height, i + offset) for offset in corners])
 
 
-def bounds_map(mi: Any, g: CoatLayout, rest: Any, height: Any) -> tuple[Any, Any, Any]:
-    """Lowest and highest z of 5 × 5 tiles, deepest of 3 × 3; each (B·tiles_y·tiles_x) [m]."""
+def bounds_map(mi: Any, g: CoatLayout, height: Any) -> tuple[Any, Any]:
+    """Lowest and highest z of 5 × 5 tiles, each (B·tiles_y·tiles_x) [m]."""
     envs = dr.width(height) // (g.nx * g.ny)
     rows = dr.arange(mi.UInt32, envs * g.ny * g.tiles_x)
     tx, row = rows % g.tiles_x, rows // g.tiles_x
-    lo, hi, deep = mi.Float(np.inf), mi.Float(-np.inf), mi.Float(0)
+    lo, hi = mi.Float(np.inf), mi.Float(-np.inf)
     for k in range(-1, g.tile_x + 1):
         ix = mi.UInt32(dr.clip(mi.Int32(tx * g.tile_x) + k, 0, g.nx - 1))
         z = dr.gather(mi.Float, height, row * g.nx + ix)
-        depth = dr.gather(mi.Float, rest, (row % g.ny) * g.nx + ix) - z
-        lo, hi, deep = dr.minimum(lo, z), dr.maximum(hi, z), dr.maximum(deep, depth)
-    dr.eval(lo, hi, deep)
+        lo, hi = dr.minimum(lo, z), dr.maximum(hi, z)
+    dr.eval(lo, hi)
     tiles = dr.arange(mi.UInt32, envs * g.tiles_y * g.tiles_x)
     tx, ty, env = tiles % g.tiles_x, (tiles // g.tiles_x) % g.tiles_y, tiles // (g.tiles_x * g.tiles_y)
-    lo2, hi2, deep2 = mi.Float(np.inf), mi.Float(-np.inf), mi.Float(0)
+    lo2, hi2 = mi.Float(np.inf), mi.Float(-np.inf)
     for k in range(-1, g.tile_y + 1):
         iy = mi.UInt32(dr.clip(mi.Int32(ty * g.tile_y) + k, 0, g.ny - 1))
         i = (env * g.ny + iy) * g.tiles_x + tx
-        lo2 = dr.minimum(lo2, dr.gather(mi.Float, lo, i))
-        hi2 = dr.maximum(hi2, dr.gather(mi.Float, hi, i))
-        deep2 = dr.maximum(deep2, dr.gather(mi.Float, deep, i))
-    dr.eval(lo2, hi2, deep2)
-    lo3, hi3, deep3 = lo2, hi2, deep2
+        lo2, hi2 = dr.minimum(lo2, dr.gather(mi.Float, lo, i)), dr.maximum(hi2, dr.gather(mi.Float, hi, i))
+    dr.eval(lo2, hi2)
+    lo3, hi3 = lo2, hi2
     for sx in range(-2, 3):
         for sy in range(-2, 3):
             nx = mi.UInt32(dr.clip(mi.Int32(tx) + sx, 0, g.tiles_x - 1))
             ny = mi.UInt32(dr.clip(mi.Int32(ty) + sy, 0, g.tiles_y - 1))
             i = (env * g.tiles_y + ny) * g.tiles_x + nx
-            lo3 = dr.minimum(lo3, dr.gather(mi.Float, lo2, i))
-            hi3 = dr.maximum(hi3, dr.gather(mi.Float, hi2, i))
-            if max(abs(sx), abs(sy)) <= 1:
-                deep3 = dr.maximum(deep3, dr.gather(mi.Float, deep2, i))
-    return lo3, hi3, deep3
+            lo3, hi3 = dr.minimum(lo3, dr.gather(mi.Float, lo2, i)), dr.maximum(hi3, dr.gather(mi.Float, hi2, i))
+    return lo3, hi3
 
 
 @dataclass(frozen=True)

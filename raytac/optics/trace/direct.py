@@ -30,6 +30,11 @@ class Arrival:
     turn: Any
     """Tangent of elevation at the coat over extent along ``up`` [1/m]."""
 
+    def tangent(self, lamp: Lamp, share: Any) -> Any:
+        """Tangent of half the elevation that the shorter edge and ``share`` of the longer one span."""
+        half = share * dr.abs(dr.dot(self.up, lamp.half_u)) + dr.abs(dr.dot(self.up, lamp.half_v))
+        return dr.maximum(half * self.turn, 1e-4)
+
 
 def arrival(mi: Any, seen: PixelSample, lamp: Lamp, light: Any, slab: Slab | None) -> Arrival:
     """Light of a point of ``lamp``, ``light`` [m], at ``seen``, through ``slab`` if any."""

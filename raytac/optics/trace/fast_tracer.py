@@ -22,13 +22,14 @@ import numpy as np
 from raytac.gel.surface import GelSurface, PadGrid, grid_pitch, make_grid
 from raytac.optics.base import casts_shadows
 from raytac.optics.device_mode import DeviceFrame, Float, FrameInputs, UInt8
-from raytac.optics.geometry import CoatField, CoatLayout, PixelSample, see
+from raytac.optics.geometry import CoatField, CoatLayout, PixelSample, concave_cover, see
 from raytac.optics.ink import ink_at, inked_albedo
 from raytac.optics.response import mid_grey_exposure
 from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.direct import direct_light
 from raytac.optics.trace.interreflection import BounceField, CaseLight
 from raytac.optics.trace.led import Lamp
+from raytac.optics.trace.occluders import Occluders
 from raytac.optics.trace.quadrature import quadrature
 from raytac.optics.trace.shadow import ShadowGrid
 from raytac.optics.trace.tracer import Tracer, total
@@ -44,6 +45,8 @@ class FastArrays:
     """Grid of indirect light; None without inter-reflection."""
     shadow: ShadowGrid | None
     """Grid of the LEDs' visible shares; None without cast shadows."""
+    occluders: Occluders | None
+    """Bounds on what casts them."""
     scale: list[Float]
     """The response's gain by channel."""
 
@@ -71,7 +74,8 @@ class FastTracer(Tracer):
             case = CaseLight.of(mi, self.sensor, grid, self._scene_lamps, self.groups, self.seed)
             bounce = BounceField.build(mi, self.layout, case, self.camera, self.sensor.gelpad.thickness, self._lit_channels)
         shadow = self._shadow_grid(self.layout) if self._lit and self.shadows else None
-        self._arrays = FastArrays(lamps, bounce, shadow, [])
+        occluders = None if shadow is None else shadow.occluders(mi, self.layout, concave_cover(grid), lamps, self.slab)
+        self._arrays = FastArrays(lamps, bounce, shadow, occluders, [])
         self._set_flat_field(grid)
         return replace(self._arrays, scale=self.response.device_scale(mi, self.camera))
 
@@ -94,7 +98,7 @@ class FastTracer(Tracer):
         if self.config.bounce:
             indirect = BounceField.memory_per_env(layout, self.camera, self.sensor.gelpad.thickness, self._lit_channels)
         if self.shadows:
-            indirect += self._shadow_grid(layout).memory_per_env
+            indirect += self._shadow_grid(layout).memory_per_env(layout)
         field = 8 * grid.rest.size + CoatField.memory_per_env(layout)  # height and ink
         return self._lit * (field + indirect + width * height * pixel)
 
@@ -126,8 +130,8 @@ class FastTracer(Tracer):
         mi, layout = self.mi, self.layout
         envs = dr.width(heights) // (layout.nx * layout.ny)
         field = CoatField(mi, layout, inputs.rest, heights)
-        bounce, shadow = inputs.own.bounce, inputs.own.shadow
-        shares = None if shadow is None else shadow.shares(mi, field, inputs.own.lamps, envs, self.slab)
+        bounce, shadow, occluders = inputs.own.bounce, inputs.own.shadow, inputs.own.occluders
+        shares = None if shadow is None else shadow.shares(mi, field, occluders, inputs.own.lamps, envs, self.slab)
         radiosity = partial(self._radiosity, shares, inputs)
         grids = None if bounce is None else bounce.gather_light(mi, field, radiosity, envs, by_layer)
         sums: list[Any] = []

@@ -5,7 +5,7 @@ A strip of light casts no edge but a penumbra as wide as the strip. Its visible 
     V(p) = ∫ g(φ) S(φ) dφ / ∫ g(φ) dφ,
 
 over the angle φ at which p sees the points of the strip's longer edge. g is the light that p would get from there, S the share of the
-shorter edge above the horizon in that direction (``CoatField.visibility``). Equal steps of φ put the nodes where the light comes from
+shorter edge above the horizon in that direction (``Depths.visibility``). Equal steps of φ put the nodes where the light comes from
 (equi-angular sampling; Kulla and Fajardo, Importance sampling techniques for path tracing in participating media, EGSR 2012, section 4).
 
 V is computed on a grid over the pad, not for each pixel, and interpolated. Neighbours of a 2 × 2 block take nodes a quarter of a step apart
@@ -17,6 +17,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial, reduce
+from operator import or_
 from typing import Any
 
 import drjit as dr
@@ -27,6 +29,8 @@ from raytac.optics.geometry import CoatField, CoatLayout, NodeGrid, PixelSample,
 from raytac.optics.refraction import Slab
 from raytac.optics.trace.direct import arrival
 from raytac.optics.trace.led import Lamp
+from raytac.optics.trace.occluders import Occluders
+from raytac.optics.trace.shadow_ray import Depths, DepthTiling
 from raytac.specs.sensor import LedSpec
 
 COARSER = 1.5
@@ -73,51 +77,88 @@ class ShadowGrid:
         counts = tuple(refinement * max(1, int(np.ceil(angle(led) / STEP))) for led in leds)
         return cls(nodes, _window(nodes, camera, thickness), counts, BLOCK if extended else 1)
 
-    @property
-    def memory_per_env(self) -> int:
+    def memory_per_env(self, layout: CoatLayout) -> int:
         """Bytes of one environment's shares while they are filtered."""
         _, _, columns, rows = self.view
-        return 3 * 16 * -(-len(self.counts) // 4) * columns * rows
+        tiling = self._tiling(layout)
+        spans = 16 * len(self.counts) * int(np.prod(tiling.blocks))
+        return 3 * 16 * -(-len(self.counts) // 4) * columns * rows + tiling.memory_per_env + spans
 
-    def shares(self, mi: Any, field: CoatField, lamps: Sequence[Lamp], envs: int, slab: Slab | None) -> list[Any]:
+    def _tiling(self, layout: CoatLayout) -> DepthTiling:
+        """Tiles with a margin as wide as the neighbours of a node, and theirs."""
+        return DepthTiling(layout, 2 * (self.block > 1) * max(self.nodes.dx, self.nodes.dy))
+
+    def occluders(self, mi: Any, layout: CoatLayout, rest: np.ndarray, lamps: Sequence[Lamp], slab: Slab | None) -> Occluders:
+        """Bounds on what can cast shadows on the nodes; ``rest``: cover [m] of the gel, (Ny, Nx)."""
+        return Occluders.build(mi, self._tiling(layout), rest, lamps, self.counts, self.block**2, slab)
+
+    def shares(
+        self, mi: Any, field: CoatField, occluders: Occluders, lamps: Sequence[Lamp], envs: int, slab: Slab | None
+    ) -> list[Any]:
         """Visible shares of ``lamps`` at the nodes in view, four LEDs a packet, B·rows·columns."""
         g, (left, top, columns, rows) = self.nodes, self.view
+        depths = Depths(mi, field, occluders.tiling, envs)
+        spans = occluders.spans(mi, depths, lamps)
         i = dr.arange(mi.UInt32, envs * (columns * rows))
         env, ix, iy = i // (columns * rows), i % columns + left, (i // columns) % rows + top
         x, y = g.x0 + g.dx * mi.Float(ix), g.y0 + g.dy * mi.Float(iy)
+        block = occluders.tiling.block(mi, env, x, y)
+        own = [dr.gather(mi.Vector4f, span, block) for span in spans]
+        is_shaded = [span.x <= span.y for span in own]
         p = mi.Point3f(x, y, field.z(env, x, y))
         here = PixelSample(env, p, field.normal(env, x, y), mi.Vector3f(0, 0, -1))
         part = (mi.Float(self.block * (iy % self.block) + ix % self.block) + 0.5) / self.block**2
-        sums = [self._seen(mi, field, here, lamp, count, part, slab) for lamp, count in zip(lamps, self.counts, strict=True)]
+        sums = []
+        for lamp, count, span, shaded in zip(lamps, self.counts, own, is_shaded, strict=True):
+            seen = partial(self._seen, mi, depths, here, lamp, count, part, slab, span)
+            sums.append(
+                dr.if_stmt((), shaded, seen, lambda: (mi.Float(1), mi.Float(1)), label="shadow of an LED", mode="symbolic")
+            )
         packets = [_packets(mi, [pair[k] for pair in sums]) for k in (0, 1)]
         dr.eval(packets)
         column, row = mi.Int32(i % columns), mi.Int32((i // columns) % rows)
-        sums_of = [[mi.Vector4f(0) for _ in kind] for kind in packets]
-        for a, b, weight in _FILTER[self.block]:
-            at = mi.UInt32(dr.clip(row + a, 0, rows - 1) * columns + dr.clip(column + b, 0, columns - 1)) + env * (columns * rows)
-            for kind, total in zip(packets, sums_of, strict=True):
-                for k, packet in enumerate(kind):
-                    total[k] += weight * dr.gather(mi.Vector4f, packet, at)
-        # A node that faces away from an LED has no share of it; neighbours then count alone.
-        result = [dr.ravel(dr.select(whole > 0, seen / whole, 1)) for seen, whole in zip(*sums_of, strict=True)]
+
+        def filtered() -> list[Any]:
+            """Shares of all LEDs, four a packet."""
+            sums_of = [[mi.Vector4f(0) for _ in kind] for kind in packets]
+            for a, b, weight in _FILTER[self.block]:
+                at = mi.UInt32(dr.clip(row + a, 0, rows - 1) * columns + dr.clip(column + b, 0, columns - 1)) + env * (
+                    columns * rows
+                )
+                for kind, total in zip(packets, sums_of, strict=True):
+                    for k, packet in enumerate(kind):
+                        total[k] += weight * dr.gather(mi.Vector4f, packet, at)
+            # A node that faces away from an LED has no share of it; neighbours then count alone.
+            return [dr.select(whole > 0, seen / whole, 1) for seen, whole in zip(*sums_of, strict=True)]
+
+        # Where no neighbour has a shadow, the mean of those that were left out would be 1 as well.
+        any_shaded = reduce(or_, is_shaded)
+        lit = [mi.Vector4f(1) for _ in packets[0]]
+        shares = dr.if_stmt((), any_shaded, filtered, lambda: lit, label="filter of shadows", mode="symbolic")
+        result = [
+            dr.ravel(mi.Vector4f(*(dr.select(one, share, 1) for one, share in zip(four, packet, strict=False))))
+            for packet, four in (
+                (shares[k], [*is_shaded[4 * k : 4 * k + 4], *[mi.Bool(False)] * 3][:4]) for k in range(len(shares))
+            )
+        ]
         dr.eval(result)
         return result
 
     def _seen(
-        self, mi: Any, field: CoatField, here: PixelSample, lamp: Lamp, count: int, part: Any, slab: Slab | None
+        self, mi: Any, depths: Depths, here: PixelSample, lamp: Lamp, count: int, part: Any, slab: Slab | None, span: Any
     ) -> tuple[Any, Any]:
-        """(light with shadows, light without) of one LED at the nodes, for unit power."""
+        """(light with shadows, light without) of one LED at the nodes, for unit power.
+
+        ``span``: what may block it, as of ``Occluders.spans``.
+        """
         seen, whole, sight = mi.Float(0), mi.Float(0), lamp.sight(mi, here.p)
         for k in range(count):
             u, density = sight.at((k + part) / count)
             light = arrival(mi, here, lamp, lamp.point(u, 0), slab)
             gain = light.gain * density
             # Its own part of the longer edge, and the whole shorter one, across the ray in the vertical plane.
-            half = density / (count * self.block**2) * dr.abs(dr.dot(light.up, lamp.half_u)) + dr.abs(
-                dr.dot(light.up, lamp.half_v)
-            )
-            tan_half = dr.maximum(half * light.turn, 1e-4)
-            seen += gain * field.visibility(here.env, here.p, light.target, tan_half, gain > 0)
+            tangent = light.tangent(lamp, density / (count * self.block**2))
+            seen += gain * depths.visibility(here.env, here.p, light.target, tangent, gain > 0, span)
             whole += gain
         return seen, whole
 
