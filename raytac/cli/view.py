@@ -19,7 +19,7 @@ from raytac.observe import ObservationSettings
 from raytac.optics import OPTICS
 from raytac.physics import PHYSICS, PhysicsConfig
 from raytac.sensor import TactileSensor
-from raytac.specs import PADS, PressScene, TaskScene, available, load_scene
+from raytac.specs import PADS, PressScene, TaskScene, available, load_scene, load_sensor
 from raytac.specs.sensor_file import sensor_spec
 from raytac.specs.task import COUPLINGS
 from raytac.warp_messages import quiet_warp
@@ -144,13 +144,14 @@ class ViewArgs(ShadowOptions):
         return scripted_session(self.scene, **settings) if path.suffix != ".pt" else policy_session(path, **settings)
 
     def _menu(self, scene: PressScene | TaskScene) -> SessionMenu:
-        """Drop-downs of what is shipped, and of what was named beside."""
+        """Drop-downs of what is shipped and fits ``--markers``, and of what was named beside."""
         from raytac.view.session import SessionMenu
 
         kind, label = ("press scene", "object") if isinstance(scene, PressScene) else ("task scene", "task")
         sensor = self.sensor or ("gelsight_mini" if isinstance(scene, PressScene) else scene.robot.sensor)
         chosen = {label: self.scene, "sensor": str(sensor)}
-        shipped = {label: available(kind), "sensor": available("sensor")}
+        sensors = [name for name in available("sensor") if self.markers is None or load_sensor(name).markers.rows]
+        shipped = {label: available(kind), "sensor": sensors}
         options = {name: tuple(dict.fromkeys((*names, chosen[name]))) for name, names in shipped.items()}
         return SessionMenu(options, chosen, lambda choice: self._session_of(choice[label], choice["sensor"]))
 

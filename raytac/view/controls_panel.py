@@ -103,7 +103,7 @@ class ControlsPanel:
 
     def _set(self, control: Control, value: float) -> None:
         steps = round((min(max(value, control.low), control.high) - control.low) / control.step)
-        self._sliders[control.name].value = min(control.low + steps * control.step, control.high)
+        self._sliders[control.name].value = round(min(control.low + steps * control.step, control.high), 9)
 
     def _follow(self, control: Control, slider: GuiSliderHandle[float]) -> None:
         def moved(event: GuiEvent[Any]) -> None:

@@ -28,7 +28,7 @@ _MODES = {
     "loading": "loading what was chosen …",
     "paused": "paused",
     "playing": "playing",
-    "driving": "on the way to the sliders",
+    "driving": "moving to the sliders' values",
     "stopped": "stopped: the program that served this page has ended",
 }
 _COMMANDS = ("Play", "Pause", "Step", "Reset")
@@ -175,8 +175,10 @@ class Page:
         self._last = None
 
     def _forget(self) -> None:
-        """Begin scales and timeline again."""
+        """Begin scales and timeline again, and leave out what was said of a saved file."""
         with self._drawing:
+            if self._saver is not None:
+                self._saved.visible = False
             for scale in self._scales.values():
                 scale.reset()
             self._sensors.heights.reset()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, Protocol
 
@@ -18,6 +19,8 @@ from raytac.world.world_state import WorldState
 _POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 _REACH_MM, _TILT, _YAW = 100.0, 45.0, 180.0
 """Range of the sliders about the site's start: [mm], [degrees] about x and y, and about z."""
+_JOINT_STEP = 0.1
+"""Step of a joint's slider [mm or degrees]; its ends are whole steps within the joint's range."""
 _SPEED = {"mm": 50.0, "°": 45.0}
 """Fastest change of what is asked of the robot, in these units per second."""
 _OPENING_SPEED = 40.0
@@ -244,10 +247,10 @@ class Steering:
         low, high = (float(factor * end) for end in arm.range[k])
         if not np.isfinite([low, high]).all():
             low, high = (-_REACH_MM, _REACH_MM) if arm.slides[k] else (-180.0, 180.0)
+        low, high = math.ceil(low / _JOINT_STEP) * _JOINT_STEP, math.floor(high / _JOINT_STEP) * _JOINT_STEP
         self._speeds[name] = _SPEED[unit]
-        return Control(
-            name, f"{arm.joints[k]} [{unit}]", low, high, 0.1, "Position that the joint's spring and damper hold it at"
-        )
+        hint = "Position that the joint's spring and damper hold it at"
+        return Control(name, f"{arm.joints[k]} [{unit}]", round(low, 6), round(high, 6), _JOINT_STEP, hint)
 
     def _actuator_control(self, name: str, one: Actuator) -> Control:
         low, high = one.factor * one.low, one.factor * one.high

@@ -106,6 +106,7 @@ def test_without_mink_the_joints_are_steered_alone_and_the_page_says_why(monkeyp
     monkeypatch.setattr(ik, "_mink", missing)
     view = session("ball_rolling")
     assert [control.label for control in view.controls] == [f"joint{k} [°]" for k in range(1, 8)] and view.handle is None
+    assert (view.controls[0].low, view.controls[0].high) == (-166.0, 166.0)  # whole steps within 166.003°
     start = view.snapshot().pads["sensor"].world_from_pad
     shot = after(view, 20)
     assert "mink is not installed" in shot.warning
