@@ -15,7 +15,6 @@ The file has columns ``depth_mm`` and ``force_n``; lines that begin with # are s
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -26,16 +25,13 @@ import numpy as np
 import tyro
 
 from experiments.running import recorded, run
+from raytac.calibrate import ForceTable, ball_forces, modulus_factor
 from raytac.checks import check_number
 from raytac.device import resolve_device
-from raytac.errors import InputError, RaytacError
+from raytac.errors import InputError
 from raytac.io import CommonOptions, parse_names
-from raytac.physics import PressPad, RigidPad, SoftPad
-from raytac.specs import PADS, ObjectSpec, PressScene, StageSpec, load_sensor
-
-COLUMNS = "depth_mm", "force_n"
-PITCH = 0.1e-3
-"""Spacing of the nodes [m]."""
+from raytac.physics import Ipc, Rigid
+from raytac.specs import PADS, load_sensor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,50 +54,6 @@ class Args(CommonOptions):
     """Name of a shipped sensor, or path of a sensor file."""
 
 
-@dataclass(frozen=True)
-class Measured:
-    """Forces [N] at depths [m], (N,) each."""
-
-    depth: np.ndarray
-    force: np.ndarray
-
-    @classmethod
-    def read(cls, path: Path) -> Measured:
-        """Rows of a file, by depth; raises ``InputError`` for anything but numbers above 0, each depth once, at least two."""
-        try:
-            lines = [line for line in path.read_text("utf-8").splitlines() if line.strip() and not line.startswith("#")]
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError("data", value=str(path), rule=f"cannot be read: {error}") from error
-        rows = list(csv.DictReader(lines))
-        if not rows or any(name not in rows[0] for name in COLUMNS):
-            raise InputError("data", value=str(path), rule=f"must have the columns {', '.join(COLUMNS)} and a row of numbers")
-        try:
-            values = np.array([[float(row[name]) for name in COLUMNS] for row in rows])
-        except (TypeError, ValueError) as error:
-            raise InputError("data", value=str(path), rule=f"must hold numbers: {error}") from error
-        if not (np.isfinite(values) & (values > 0.0)).all() or len(np.unique(values[:, 0])) < max(2, len(values)):
-            raise InputError("data", value=str(path), rule="must hold depths and forces above 0, each depth once, at least two")
-        depth, force = values[values[:, 0].argsort()].T
-        return cls(1e-3 * depth, force)
-
-
-def pressed_forces(pad: PressPad, depths: np.ndarray) -> np.ndarray:
-    """Normal force [N] at each of ``depths`` [m], ascending; raises ``RaytacError`` for a state that the physics marks as failed."""
-    forces = []
-    for depth in depths:
-        (reading,) = pad.follow(StageSpec("indent", depth=float(depth)))
-        if reading.failed.any() or (reading.unconverged is not None and reading.unconverged.any()):
-            raise RaytacError(f"the press to {1e3 * depth:g} mm did not converge")
-        forces.append(float(reading.wrench[0, 2]))
-    return np.abs(forces)
-
-
-def modulus_factor(force: np.ndarray, measured: np.ndarray) -> float:
-    """Factor c of the modulus that makes Σ (c F / F_measured − 1)² least."""
-    share = force / measured
-    return float(share.sum() / (share**2).sum())
-
-
 def held_out_errors(force: np.ndarray, measured: np.ndarray) -> np.ndarray:
     """Error of every depth with the modulus fitted to the others, (N,)."""
     factors = [modulus_factor(np.delete(force, k), np.delete(measured, k)) for k in range(len(force))]
@@ -110,7 +62,7 @@ def held_out_errors(force: np.ndarray, measured: np.ndarray) -> np.ndarray:
 
 def main(args: Args) -> None:
     check_number("radius_mm", args.radius_mm, "(0, 100]", "mm")
-    measured, sensor = Measured.read(args.data), load_sensor(args.sensor)
+    measured, sensor = ForceTable.read(args.data), load_sensor(args.sensor)
     levels = parse_names(args.levels, "levels", PADS) if args.levels else ()
     if args.modulus_kpa is not None:
         modulus = 1e3 * check_number("modulus_kpa", args.modulus_kpa, "(0, 1e6]", "kPa")
@@ -124,8 +76,6 @@ def main(args: Args) -> None:
         suffix = "".join(f".{name.removesuffix('_ratio')}_{value:g}" for name, value in changes.items())
         variants.append((suffix, replace(sensor, gelpad=replace(sensor.gelpad, **changes))))
     device = resolve_device(args.device, ray_tracing=False)
-    ball = ObjectSpec("sphere", {"radius": args.radius_mm / 1e3}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)
-    scene = PressScene("ball", ball, (StageSpec("indent", depth=float(measured.depth[-1])),))
     with recorded(args, "real_force", device=device) as (_, metrics):
         pad = sensor.gelpad
         metrics |= {"sensor": sensor.name, "modulus_kpa": pad.youngs_modulus / 1e3}
@@ -139,12 +89,10 @@ def main(args: Args) -> None:
         print("| measured [N] | " + " | ".join(f"{force:.2f}" for force in measured.force) + " | | | |", flush=True)
         for name in ("rigid", *levels):
             for suffix, own in variants:
-                if name == "rigid":
-                    if ".friction" in suffix:
-                        continue
-                    force = pressed_forces(RigidPad(own, scene, pitch=PITCH), measured.depth)
-                else:
-                    force = pressed_forces(SoftPad(own, scene, pitch=PITCH, level=name, device=device), measured.depth)
+                if name == "rigid" and ".friction" in suffix:
+                    continue
+                physics = Rigid() if name == "rigid" else Ipc(level=name)
+                (force,) = ball_forces(own, [physics], args.radius_mm / 1e3, measured.depth, device=device)
                 figures = errors_of(force, measured, names)
                 figures["modulus_kpa"] = modulus_factor(force, measured.force) * pad.youngs_modulus / 1e3
                 metrics |= {f"force.{name}{suffix}.{key}": value for key, value in figures.items()}
@@ -153,7 +101,7 @@ def main(args: Args) -> None:
                 print(f"| {name}{suffix} | {' | '.join(cells)} | {figures['modulus_kpa']:.0f} |", flush=True)
 
 
-def errors_of(force: np.ndarray, measured: Measured, names: Sequence[str]) -> dict[str, float]:
+def errors_of(force: np.ndarray, measured: ForceTable, names: Sequence[str]) -> dict[str, float]:
     """Forces of a pad and their errors, by the depths' ``names``."""
     error, held_out = force / measured.force - 1.0, held_out_errors(force, measured.force)
     figures = {"worst": float(np.abs(error).max()), "held_out_worst": float(np.abs(held_out).max())}

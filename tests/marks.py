@@ -59,6 +59,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "world/test_scene_camera.py",
     ),
     "solver": (
+        "calibrate/test_gel_forces.py",
         "dataset",
         "envs",
         "ipc",

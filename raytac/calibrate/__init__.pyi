@@ -3,6 +3,11 @@ from .ball_presses import contact_radius as contact_radius
 from .ball_presses import pressed_balls as pressed_balls
 from .circles import with_found_circles as with_found_circles
 from .direct_fit import FitSettings as FitSettings
+from .gel_forces import ForceTable as ForceTable
+from .gel_forces import GelFit as GelFit
+from .gel_forces import ball_forces as ball_forces
+from .gel_forces import fit_gel as fit_gel
+from .gel_forces import modulus_factor as modulus_factor
 from .grain import measured_grain as measured_grain
 from .model_fits import ALONE as ALONE
 from .model_fits import Models as Models

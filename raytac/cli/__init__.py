@@ -30,7 +30,7 @@ COMMANDS = {
     "train": ("TrainArgs", "train a policy for a task by PPO, on the CPU or one GPU"),
     "play": ("PlayArgs", "play a policy: a film with tactile images, and a success rate"),
     "bake": ("BakeArgs", "bake a Taxim table from the ray tracer of a sensor"),
-    "calibrate": ("CalibrateArgs", "fit a sensor to photographs, or its markers to the soft pad"),
+    "calibrate": ("CalibrateArgs", "fit a sensor to photographs or forces, or its markers to the soft pad"),
     "compare-real": ("CompareRealArgs", "fit to some photographs of presses and test on the others"),
     "doctor": ("DoctorArgs", "try everything that the jobs need, and say how to fix it"),
 }

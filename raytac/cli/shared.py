@@ -120,7 +120,7 @@ class FitOptions(CommonOptions):
     """Options of a command that fits models to photographs."""
 
     ball_diameter_mm: float | None = None
-    """Diameter of the ball, of plain photographs and a dataPack.npz, which do not say it."""
+    """Diameter of the ball, of plain photographs, a dataPack.npz or forces, which do not say it."""
     sides: str = FROM_SCRATCH
     """Numbers of red, green, blue LEDs at their walls, joined by commas; or `own`, the sensor's.
 

@@ -24,6 +24,7 @@ from .sensor import RefractionSpec as RefractionSpec
 from .sensor import ResponseSpec as ResponseSpec
 from .sensor import SensorSpec as SensorSpec
 from .sensor_check import validate_sensor as validate_sensor
+from .sensor_file import gelpad_files as gelpad_files
 from .sensor_file import lights_text as lights_text
 from .sensor_file import load_lights as load_lights
 from .sensor_file import load_sensor as load_sensor

@@ -223,6 +223,18 @@ def sensor_files(sensor: SensorSpec) -> dict[str, str]:
     return {"sensor.toml": "\n".join(["\n".join(head) + "\n", *blocks])} | files
 
 
+def gelpad_files(sensor: SensorSpec, base: str, comment: str) -> dict[str, str]:
+    """Texts by name of file: a ``sensor.toml`` on ``base`` with the gelpad of ``sensor``.
+
+    Where its surface is a map, that is a file beside it.
+
+    ``base``: name of a shipped sensor, or a path from the file's folder; ``comment``: where the gelpad's values are from.
+    """
+    top = "\n".join([*(f"# {line}" for line in comment.splitlines()), "", f'base = "{base}"'])
+    files = {"sensor.toml": f"{top}\n\n{_table(sensor, 'gelpad')}"}
+    return files if sensor.gelpad.surface is None else files | {_SURFACE: _map_text(sensor.gelpad.surface)}
+
+
 def _shipped_base(sensor: SensorSpec) -> str | None:
     """Name of the shipped sensor that this is but for lights, response, optics, noise; or None."""
     source = sensor.source

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from experiments import real_force, real_markers
+from raytac.calibrate import ball_forces, modulus_factor
 from raytac.errors import InputError
 from raytac.io.images import write_png
 from raytac.io.metrics import read_metrics
 from raytac.markers.registry import markers_config
-from raytac.physics import RigidPad
-from raytac.specs import ObjectSpec, PressScene, StageSpec, load_sensor
+from raytac.physics import Rigid
+from raytac.specs import load_sensor
 
 SIZE, PITCH = (320, 240), 0.0532
 CIRCLE, BALL = np.array([150.0, 118.0, 36.0]), 3e-3
@@ -33,9 +34,7 @@ def measured(folder: Path, force: np.ndarray, depths: tuple[float, ...]) -> Path
 def test_a_modulus_is_recovered_from_forces_of_the_pad_itself(tmp_path: Path) -> None:
     """Forces 1.25 times the pad's own are off by a fifth, and by nothing with the modulus fitted to other depths."""
     depths = 0.3, 0.6, 1.0
-    ball = ObjectSpec("sphere", {"radius": 5e-3}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.1)
-    pad = RigidPad(load_sensor("gelsight_mini"), PressScene("ball", ball, (StageSpec("indent", depth=1e-3),)), pitch=1e-4)
-    own = real_force.pressed_forces(pad, 1e-3 * np.array(depths))
+    (own,) = ball_forces(load_sensor("gelsight_mini"), [Rigid()], 5e-3, 1e-3 * np.array(depths))
     assert own[0] > 0.1 and (np.diff(own) > 0).all()
     data = measured(tmp_path, 1.25 * own, depths)
     args = real_force.Args(data=data, radius_mm=5.0, levels="", poisson_ratios="0.3", out=tmp_path / "run", device="cpu")
@@ -59,27 +58,16 @@ def test_a_modulus_is_recovered_from_forces_of_the_pad_itself(tmp_path: Path) ->
 
 def test_a_fitted_modulus_is_of_the_other_depths() -> None:
     force, true = np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 6.0])
-    assert real_force.modulus_factor(force, force) == 1.0
+    assert modulus_factor(force, force) == 1.0
     np.testing.assert_allclose(real_force.held_out_errors(force, true)[2], -0.5)
-    factor = real_force.modulus_factor(force, true)
+    factor = modulus_factor(force, true)
     off = [np.square(f * force / true - 1.0).sum() for f in (factor - 1e-4, factor, factor + 1e-4)]
     assert off[1] < min(off[0], off[2])
 
 
-def test_files_of_forces_that_say_nothing_are_refused(tmp_path: Path) -> None:
-    cases = {
-        "depth_mm\n1\n": "columns",
-        "depth_mm,force_n\n1,x\n2,3\n": "numbers",
-        "depth_mm,force_n\n1,2\n1,3\n": "each depth once",
-    }
-    for text, message in cases.items():
-        (tmp_path / "force.csv").write_text(text, "utf-8")
-        with pytest.raises(InputError, match=message):
-            real_force.Measured.read(tmp_path / "force.csv")
-    with pytest.raises(InputError, match="cannot be read"):
-        real_force.Measured.read(tmp_path / "none.csv")
+def test_ratios_that_no_gel_has_are_refused(tmp_path: Path) -> None:
+    data = measured(tmp_path, np.array([1.0, 2.0]), (1.0, 2.0))
     with pytest.raises(InputError, match="poisson_ratios"):
-        data = measured(tmp_path, np.array([1.0, 2.0]), (1.0, 2.0))
         real_force.main(real_force.Args(data=data, radius_mm=5.0, levels="", poisson_ratios="0.6", device="cpu"))
 
 
