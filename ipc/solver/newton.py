@@ -43,7 +43,7 @@ from ipc.solver.step_state import StepState
 
 _RENEWALS = 20
 """Most renewals of friction within a step's first solve, where every body is held."""
-_CALM, _CALM_RENEWALS = 20.0, 6
+_CALM, _CALM_RENEWALS = 10.0, 6
 """Longest Newton step [ε] before a renewal where a body is free, and most of these."""
 
 
