@@ -16,7 +16,7 @@ import json
 import platform
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 PACKAGES = ("raytac", "ipc")
@@ -37,11 +37,16 @@ def modules(root: Path) -> dict[str, Path]:
     return {".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
 
 
-def imports(tree: ast.AST, module: str, names: set[str], *, is_package: bool) -> set[str]:
-    """Modules of ``names`` that ``tree`` imports anywhere."""
+def nodes_of(path: Path) -> list[ast.AST]:
+    """All nodes of a file's syntax tree; the first is the module."""
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+
+
+def imports(nodes: Iterable[ast.AST], module: str, names: set[str], *, is_package: bool) -> set[str]:
+    """Modules of ``names`` that a module imports anywhere, by the nodes of its tree."""
     result = set()
     package = module if is_package else module.rpartition(".")[0]
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Import):
             result |= {alias.name for alias in node.names if alias.name in names}
         elif isinstance(node, ast.ImportFrom):
@@ -82,9 +87,9 @@ def circles(graph: dict[str, set[str]]) -> list[list[str]]:
     return result
 
 
-def docstrings(tree: ast.Module) -> Iterator[str]:
+def docstrings(nodes: Iterable[ast.AST]) -> Iterator[str]:
     """Docstrings of the module, its classes and functions, and of constants and fields (a string after an assignment)."""
-    for node in ast.walk(tree):
+    for node in nodes:
         body = getattr(node, "body", None)
         if not isinstance(body, list):
             continue
@@ -98,9 +103,9 @@ def docstrings(tree: ast.Module) -> Iterator[str]:
                 yield after.value.value  # type: ignore[union-attr]
 
 
-def names_bound(tree: ast.AST) -> Iterator[str]:
+def names_bound(nodes: Iterable[ast.AST]) -> Iterator[str]:
     """Names that the code gives to variables, arguments, fields, functions and classes; each place where one is given counts."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Name | ast.Attribute) and isinstance(node.ctx, ast.Store):
             yield node.id if isinstance(node, ast.Name) else node.attr
         elif isinstance(node, ast.arg):
@@ -111,13 +116,20 @@ def names_bound(tree: ast.AST) -> Iterator[str]:
 
 def strings_in(node: ast.AST) -> Iterator[str]:
     """Strings that a tuple, list, set, dictionary or call holds side by side."""
-    fields = [getattr(node, name, None) for name in ("elts", "keys", "values", "args")]
-    for item in (item for field in fields if isinstance(field, list) for item in field):
+    if isinstance(node, ast.Tuple | ast.List | ast.Set):
+        items: Iterable[ast.expr | None] = node.elts
+    elif isinstance(node, ast.Dict):
+        items = (*node.keys, *node.values)
+    elif isinstance(node, ast.Call):
+        items = node.args
+    else:
+        return
+    for item in items:
         if isinstance(item, ast.Constant) and isinstance(item.value, str):
             yield item.value
 
 
-def mode_files(root: Path, library: dict[str, ast.Module]) -> list[str] | None:
+def mode_files(root: Path, library: Mapping[str, Iterable[ast.AST]]) -> list[str] | None:
     """Files of the optical mode that ``EXAMPLE`` adds; None without the example.
 
     They are the example, modules of its folder that it imports, and each module of the library that lists the mode's name beside that of
@@ -128,19 +140,19 @@ def mode_files(root: Path, library: dict[str, ast.Module]) -> list[str] | None:
     """
     if not (root / EXAMPLE).exists():
         return None
-    tree = ast.parse((root / EXAMPLE).read_text(encoding="utf-8"))
-    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and node.args]
+    example = nodes_of(root / EXAMPLE)
+    calls = [node for node in example if isinstance(node, ast.Call) and node.args]
     registered = [call.args[0] for call in calls if ast.unparse(call.func).rpartition(".")[2] == "register"]
     names = {node.value for node in registered if isinstance(node, ast.Constant)}
     if not names:
         raise ValueError(f"{EXAMPLE} must register its mode: register(NAME) with a string")
     beside = {f"{EXAMPLE.parent}.{path.stem}": path for path in (root / EXAMPLE).parent.glob("*.py")}
     beside |= {path.stem: path for path in beside.values()}
-    own = {beside[module] for module in imports(tree, EXAMPLE.stem, set(beside), is_package=False)}
+    own = {beside[module] for module in imports(example, EXAMPLE.stem, set(beside), is_package=False)}
     listed = [
         module
-        for module, code in library.items()
-        if any(names & (together := set(strings_in(node))) and together & OTHER_MODES for node in ast.walk(code))
+        for module, nodes in library.items()
+        if any(names & (together := set(strings_in(node))) and together & OTHER_MODES for node in nodes)
     ]
     return [str(EXAMPLE), *sorted(str(path.relative_to(root)) for path in own), *listed]
 
@@ -148,12 +160,13 @@ def mode_files(root: Path, library: dict[str, ast.Module]) -> list[str] | None:
 def measure(root: Path) -> tuple[dict[str, int], dict[str, list[str]]]:
     """Counts by metric name, and what was counted, for those who want to mend it."""
     files = modules(root)
-    texts = {name: path.read_text(encoding="utf-8") for name, path in files.items()}
-    trees = {name: ast.parse(text) for name, text in texts.items()}
-    lines = {name: text.count("\n") for name, text in texts.items()}
+    library = {name: nodes_of(path) for name, path in files.items()}
+    lines = {name: path.read_text(encoding="utf-8").count("\n") for name, path in files.items()}
     packages = {name for name, path in files.items() if path.name == "__init__.py"}
-    graph = {name: imports(tree, name, set(files), is_package=name in packages) for name, tree in trees.items()}
+    names = set(files)
+    graph = {name: imports(nodes, name, names, is_package=name in packages) for name, nodes in library.items()}
     importers = {name: [other for other, targets in graph.items() if name in targets and other not in packages] for name in files}
+    texts = [(name, text) for name, nodes in library.items() for text in docstrings(nodes)]
     details = {
         "files_over_400": [name for name in files if lines[name] > LONG_FILE],
         "circles": [" <-> ".join(circle) for circle in circles(graph)],
@@ -162,21 +175,16 @@ def measure(root: Path) -> tuple[dict[str, int], dict[str, list[str]]]:
             for name in files
             if name not in packages and lines[name] <= SMALL_FILE and len(importers[name]) == 1
         ],
-        "docstrings_wh": [
-            f"{name}: {text.splitlines()[0]}" for name, tree in trees.items() for text in docstrings(tree) if QUESTION.match(text)
+        "docstrings_wh": [f"{name}: {text.splitlines()[0]}" for name, text in texts if QUESTION.match(text)],
+        "docstrings_long": [f"{name}: {text.splitlines()[0]}" for name, text in texts if len(text.split("\n", 1)[0]) > LONG_LINE],
+        "words": [
+            f"{name}: {word}" for name, nodes in library.items() for word in names_bound(nodes) if word.strip("_") in WORDS
         ],
-        "docstrings_long": [
-            f"{name}: {text.splitlines()[0]}"
-            for name, tree in trees.items()
-            for text in docstrings(tree)
-            if len(text.split("\n", 1)[0]) > LONG_LINE
-        ],
-        "words": [f"{name}: {word}" for name, tree in trees.items() for word in names_bound(tree) if word.strip("_") in WORDS],
     }
     counts = {"files": len(files)} | {
         f"{package}_lines": sum(n for name, n in lines.items() if name.partition(".")[0] == package) for package in PACKAGES
     }
-    toy = mode_files(root, trees)
+    toy = mode_files(root, library)
     if toy is not None:
         details["mode_files"] = toy
     return counts | {name: len(items) for name, items in details.items()}, details

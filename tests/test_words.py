@@ -18,28 +18,31 @@ NOT_PROSE = {"docs/glossary.md"}
 
 
 @pytest.fixture(scope="module")
-def trees() -> dict[str, ast.Module]:
-    return {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in house.modules(ROOT).items()}
+def library() -> dict[str, list[ast.AST]]:
+    """Nodes of every file's syntax tree."""
+    return {name: house.nodes_of(path) for name, path in house.modules(ROOT).items()}
 
 
-def test_docstrings_begin_with_no_question_word(trees: dict[str, ast.Module]) -> None:
+def test_docstrings_begin_with_no_question_word(library: dict[str, list[ast.AST]]) -> None:
     wrong = [
         f"{name}: {text.splitlines()[0]}"
-        for name, tree in trees.items()
-        for text in house.docstrings(tree)
+        for name, nodes in library.items()
+        for text in house.docstrings(nodes)
         if house.QUESTION.match(text)
     ]
     assert not wrong, "begin with a noun phrase, an imperative verb or 'True if':\n" + "\n".join(wrong)
 
 
-def test_docstrings_begin_with_one_short_line(trees: dict[str, ast.Module]) -> None:
-    firsts = [(name, text.split("\n", 1)[0]) for name, tree in trees.items() for text in house.docstrings(tree)]
+def test_docstrings_begin_with_one_short_line(library: dict[str, list[ast.AST]]) -> None:
+    firsts = [(name, text.split("\n", 1)[0]) for name, nodes in library.items() for text in house.docstrings(nodes)]
     wrong = [f"{name}: {first}" for name, first in firsts if len(first) > house.LONG_LINE]
     assert not wrong, f"first lines of at most {house.LONG_LINE} characters:\n" + "\n".join(wrong)
 
 
-def test_names_say_what_they_hold(trees: dict[str, ast.Module]) -> None:
-    wrong = [f"{name}: {word}" for name, tree in trees.items() for word in house.names_bound(tree) if word.strip("_") in NAMES]
+def test_names_say_what_they_hold(library: dict[str, list[ast.AST]]) -> None:
+    wrong = [
+        f"{name}: {word}" for name, nodes in library.items() for word in house.names_bound(nodes) if word.strip("_") in NAMES
+    ]
     assert not wrong, "name the result, direction, displacement or path instead:\n" + "\n".join(wrong)
 
 

@@ -139,7 +139,7 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
     for actor in actors:
         give(actor)
     lost: list[int] = []
-    while running:
+    while running and (waiting or any(shard is not None for _, shard in running.values())):  # nobody waits for a worker without work
         (done,), _ = ray.wait(list(running))
         actor, shard = running.pop(done)
         try:

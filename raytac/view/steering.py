@@ -20,7 +20,7 @@ _POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 _REACH_MM, _TILT, _YAW = 100.0, 45.0, 180.0
 """Range of the sliders about the site's start: [mm], [degrees] about x and y, and about z."""
 _JOINT_STEP = 0.1
-"""Step of a joint's slider [mm or degrees]; its ends are whole steps within the joint's range."""
+"""Step of a joint's slider [mm or degrees]; its ends are multiples, within the range."""
 _SPEED = {"mm": 50.0, "°": 45.0}
 """Fastest change of what is asked of the robot, in these units per second."""
 _OPENING_SPEED = 40.0
