@@ -11,6 +11,7 @@ shorter edge above the horizon in that direction (``Depths.visibility``). Equal 
 V is computed on a grid over the pad, not for each pixel, and interpolated. Neighbours of a 2 × 2 block take nodes a quarter of a step apart
 (interleaved sampling; Keller and Heidrich, EGWR 2001), and a binomial filter of 3 × 3 nodes, which has no response at the block's period,
 gives each of them all four sets. So a strip of N directions is integrated over 4 N, and no shadow falls apart into those of single points.
+Most nodes see all of an LED: only those that ``Occluders`` does not rule out look for shadows.
 """
 
 from __future__ import annotations
@@ -33,14 +34,16 @@ from raytac.optics.trace.occluders import Occluders
 from raytac.optics.trace.shadow_ray import Depths, DepthTiling
 from raytac.specs.sensor import LedSpec
 
-COARSER = 1.5
+COARSER = 1.3
 """Spacing of the grid's nodes over that of the pad's, if an LED is extended."""
 BLOCK = 2
 """Nodes of a block along each side, likewise; each takes its own part of the directions."""
 EXTENDED = np.deg2rad(12.0)
 """Angle from which an LED, seen from the pad's middle, is extended; others cast edges."""
-STEP = np.deg2rad(27.0)
+STEP = np.deg2rad(40.0)
 """Most of such an angle that a node takes in one step."""
+SQUARE = 4
+"""Nodes along each side of a square, whose rays take much the same path."""
 MARGIN = 4e-3
 """Width [m] about a crop whose shadows count too, by light from coat to coat."""
 
@@ -79,10 +82,27 @@ class ShadowGrid:
 
     def memory_per_env(self, layout: CoatLayout) -> int:
         """Bytes of one environment's shares while they are filtered."""
-        _, _, columns, rows = self.view
-        tiling = self._tiling(layout)
+        tiling, (columns, rows) = self._tiling(layout), self._squares
         spans = 16 * len(self.counts) * int(np.prod(tiling.blocks))
-        return 3 * 16 * -(-len(self.counts) // 4) * columns * rows + tiling.memory_per_env + spans
+        return 3 * 16 * -(-len(self.counts) // 4) * SQUARE**2 * columns * rows + tiling.memory_per_env + spans
+
+    @property
+    def _squares(self) -> tuple[int, int]:
+        """Columns and rows of squares of ``SQUARE`` × ``SQUARE`` nodes over those in view."""
+        return -(-self.view[2] // SQUARE), -(-self.view[3] // SQUARE)
+
+    def _place(self, mi: Any, i: Any) -> tuple[Any, Any, Any]:
+        """Environment, column and row in view of node ``i``; the nodes of a square follow each other."""
+        columns, rows = self._squares
+        square, inside = i // SQUARE**2, i % SQUARE**2
+        column, row = SQUARE * (square % columns) + inside % SQUARE, SQUARE * ((square // columns) % rows) + inside // SQUARE
+        return square // (columns * rows), column, row
+
+    def _number(self, env: Any, column: Any, row: Any) -> Any:
+        """Inverse of ``_place``."""
+        columns, rows = self._squares
+        square = (env * rows + row // SQUARE) * columns + column // SQUARE
+        return square * SQUARE**2 + (row % SQUARE) * SQUARE + column % SQUARE
 
     def _tiling(self, layout: CoatLayout) -> DepthTiling:
         """Tiles with a margin as wide as the neighbours of a node, and theirs."""
@@ -95,19 +115,19 @@ class ShadowGrid:
     def shares(
         self, mi: Any, field: CoatField, occluders: Occluders, lamps: Sequence[Lamp], envs: int, slab: Slab | None
     ) -> list[Any]:
-        """Visible shares of ``lamps`` at the nodes in view, four LEDs a packet, B·rows·columns."""
-        g, (left, top, columns, rows) = self.nodes, self.view
+        """Visible shares of ``lamps`` at the nodes in view, four LEDs a packet, by ``_number``."""
+        g, (left, top, columns, rows), squares = self.nodes, self.view, self._squares
         depths = Depths(mi, field, occluders.tiling, envs)
         spans = occluders.spans(mi, depths, lamps)
-        i = dr.arange(mi.UInt32, envs * (columns * rows))
-        env, ix, iy = i // (columns * rows), i % columns + left, (i // columns) % rows + top
+        env, column, row = self._place(mi, dr.arange(mi.UInt32, envs * (squares[0] * squares[1] * SQUARE**2)))
+        ix, iy = column + left, row + top
         x, y = g.x0 + g.dx * mi.Float(ix), g.y0 + g.dy * mi.Float(iy)
         block = occluders.tiling.block(mi, env, x, y)
         own = [dr.gather(mi.Vector4f, span, block) for span in spans]
         is_shaded = [span.x <= span.y for span in own]
         p = mi.Point3f(x, y, field.z(env, x, y))
         here = PixelSample(env, p, field.normal(env, x, y), mi.Vector3f(0, 0, -1))
-        part = (mi.Float(self.block * (iy % self.block) + ix % self.block) + 0.5) / self.block**2
+        part = (mi.Float(_part(self.block, ix, iy)) + 0.5) / self.block**2
         sums = []
         for lamp, count, span, shaded in zip(lamps, self.counts, own, is_shaded, strict=True):
             seen = partial(self._seen, mi, depths, here, lamp, count, part, slab, span)
@@ -116,15 +136,16 @@ class ShadowGrid:
             )
         packets = [_packets(mi, [pair[k] for pair in sums]) for k in (0, 1)]
         dr.eval(packets)
-        column, row = mi.Int32(i % columns), mi.Int32((i // columns) % rows)
 
         def filtered() -> list[Any]:
             """Shares of all LEDs, four a packet."""
             sums_of = [[mi.Vector4f(0) for _ in kind] for kind in packets]
             for a, b, weight in _FILTER[self.block]:
-                at = mi.UInt32(dr.clip(row + a, 0, rows - 1) * columns + dr.clip(column + b, 0, columns - 1)) + env * (
-                    columns * rows
+                beside, above = (
+                    mi.UInt32(dr.clip(mi.Int32(k) + step, 0, count - 1))
+                    for k, step, count in ((column, b, columns), (row, a, rows))
                 )
+                at = self._number(env, beside, above)
                 for kind, total in zip(packets, sums_of, strict=True):
                     for k, packet in enumerate(kind):
                         total[k] += weight * dr.gather(mi.Vector4f, packet, at)
@@ -167,13 +188,21 @@ class ShadowGrid:
         g, (left, top, columns, rows) = self.nodes, self.view
         k, wx, wy = g.cell(mi, 0, seen.p.x, seen.p.y)
         ix, iy = (
-            dr.clip(mi.Int32(at) - first, 0, count - 2)
+            mi.UInt32(dr.clip(mi.Int32(at) - first, 0, count - 2))
             for at, first, count in ((k % g.nx, left, columns), (k // g.nx, top, rows))
         )
-        i = (seen.env * rows + mi.UInt32(iy)) * columns + mi.UInt32(ix)
-        view = replace(g, nx=columns, ny=rows)
-        packets = [bilinear(view.corners(mi.Vector4f, packet, i), wx, wy) for packet in shares]
+        corners = [self._number(seen.env, ix + a, iy + b) for b in (0, 1) for a in (0, 1)]
+        packets = [bilinear([dr.gather(mi.Vector4f, packet, i) for i in corners], wx, wy) for packet in shares]
         return [packets[n // 4][n % 4] for n in range(len(self.counts))]
+
+
+def _part(block: int, ix: Any, iy: Any) -> Any:
+    """Quarter of the directions of node (ix, iy), or 0 in blocks of one node.
+
+    Rows of a block take 0 and 3, and 1 and 2: with the same mean, they leave the least behind after the filter.
+    """
+    a, b = ix % block, iy % block
+    return b + a * (3 - 2 * b)
 
 
 def _window(nodes: NodeGrid, camera: Pinhole, thickness: float) -> tuple[int, int, int, int]:

@@ -130,11 +130,12 @@ class Depths:
         """
         mi, g, field, cells, (columns, rows) = self.mi, self.tiling.layout, self.field, self.tiling.cells, self.tiling.tiles
         d = light - p
-        reach = dr.sqrt(d.x * d.x + d.y * d.y)
-        ux, uy, rise = d.x / reach, d.y / reach, -d.z / reach
+        square = d.x * d.x + d.y * d.y
+        inverse = dr.rsqrt(square)
+        reach, ux, uy, rise = square * inverse, d.x * inverse, d.y * inverse, -d.z * inverse
         # Clearance of the ray's lower edge above the resting surface: at least above_p + gain · s, which the coat must exceed to block.
         above_p = self._rest(p.x, p.y) - p.z
-        gain = (self._rest(light.x, light.y) - light.z - above_p) / reach - tan_half
+        gain = (self._rest(light.x, light.y) - light.z - above_p) * inverse - tan_half
         step = min(g.dx, g.dy)
         edge = cells * step
         end = dr.minimum(dr.select(gain > 0, (span.z - above_p) / gain, reach), dr.minimum(span.y, reach))
@@ -153,12 +154,14 @@ class Depths:
                 least = dr.minimum(least, clearance * dr.rcp(at))
             return (least,)
 
-        def walk(s: Any, least: Any) -> tuple[Any, Any]:
+        def near(s: Any) -> Any:
             tx = mi.UInt32(dr.clip(first_x + s * (vx * (1 / cells)), 0, columns - 1))
             ty = mi.UInt32(dr.clip(first_y + s * (vy * (1 / cells)), 0, rows - 1))
-            bound = dr.gather(mi.Float, self.windows, own + ty * columns + tx)
-            is_near = above_p + dr.minimum(gain * s, gain * (s + edge)) <= bound
-            (least,) = dr.if_stmt((s, least), is_near, look, lambda s, least: (least,), label="stretch", mode="symbolic")
+            bound = dr.gather(mi.Float, self.windows, own + (ty * columns + tx))
+            return above_p + dr.minimum(gain * s, gain * (s + edge)) <= bound
+
+        def walk(s: Any, least: Any) -> tuple[Any, Any]:
+            (least,) = dr.if_stmt((s, least), near(s), look, lambda s, least: (least,), label="stretch", mode="symbolic")
             return s + edge, least
 
         # Nothing in the way means a clearance of tan_half or more; a start of 1 would shade what lies right under an LED.
