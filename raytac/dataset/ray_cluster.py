@@ -128,7 +128,7 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
             running[actor.render.remote(shard)] = actor, shard
 
     coming: dict[int, tuple[int, float]] = {}
-    """Shard with which each worker prepares that died, and when it did, by ``time.monotonic`` [s]."""
+    """Shard with which each worker prepares that died, and when it did [s of the clock]."""
 
     def bring_back(actor: Any, shard: int, since: float) -> None:
         # Until Ray has started it again every call would fail at once; one that is retried waits for that,
