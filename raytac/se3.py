@@ -46,11 +46,6 @@ def pose_error(world_from_a: np.ndarray, world_from_b: np.ndarray) -> np.ndarray
     return np.concatenate([world_from_a[..., :3, 3] - world_from_b[..., :3, 3], turn], axis=-1)
 
 
-def shifted_wrench(wrench: np.ndarray, arm: np.ndarray) -> np.ndarray:
-    """Wrenches (…, 6) about another point; ``arm`` (…, 3) [m] goes from it to the old one."""
-    return np.concatenate([wrench[..., :3], wrench[..., 3:] + np.cross(arm, wrench[..., :3])], axis=-1)
-
-
 def rotation_of(quaternion: ArrayLike) -> np.ndarray:
     """Rotation matrices (…, 3, 3) of unit quaternions wxyz (…, 4)."""
     w, x, y, z = np.moveaxis(np.asarray(quaternion, float), -1, 0)

@@ -128,29 +128,31 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
             running[actor.render.remote(shard)] = actor, shard
 
     coming: dict[int, tuple[int, float]] = {}
-    """Shard with which each worker prepares that died, and how long it has been waited for [s]."""
+    """Shard with which each worker prepares that died, and when it did [s of the clock]."""
 
-    def bring_back(actor: Any, shard: int, waited: float = 0.0) -> None:
+    def bring_back(actor: Any, shard: int, since: float) -> None:
         # Until Ray has started it again every call would fail at once; one that is retried waits for that,
         # not for ever: a worker may die each time that it prepares. A death takes two retries, its own and that of the restart.
-        coming[id(actor)] = shard, waited
+        coming[id(actor)] = shard, since
         running[actor.prepare.options(max_task_retries=2 * _ATTEMPTS).remote(shard)] = actor, None
 
     for actor in actors:
         give(actor)
     lost: list[int] = []
-    while running and (waiting or any(shard is not None for _, shard in running.values())):  # nobody waits for a worker without work
+    while running and (
+        waiting or any(shard is not None for _, shard in running.values())
+    ):  # nobody waits for a worker without work
         (done,), _ = ray.wait(list(running))
         actor, shard = running.pop(done)
         try:
             result = ray.get(done)
         except ray.exceptions.RayActorError as error:
             if shard is None:
-                last, waited = coming[id(actor)]
+                last, since = coming[id(actor)]
                 # A machine that is busy takes longer to start it again than Ray retries.
-                if isinstance(error, ray.exceptions.ActorUnavailableError) and waited < _LONGEST_START:
+                if isinstance(error, ray.exceptions.ActorUnavailableError) and time.monotonic() - since < _LONGEST_START:
                     time.sleep(1.0)
-                    bring_back(actor, last, waited + 1.0)
+                    bring_back(actor, last, since)
                     continue
                 if not running:
                     text = f"no worker is left ({error}); run again to go on with the shards that are missing"
@@ -162,7 +164,7 @@ def _render(ray: Any, job: RenderJob, waiting: list[int], workers: int | None) -
             (waiting if again else lost).append(shard)
             if again:
                 warnings.warn(f"the worker of shard {shard} died: the shard is rendered again", RuntimeWarning, stacklevel=2)
-            bring_back(actor, shard)
+            bring_back(actor, shard, time.monotonic())
             continue
         if shard is None:
             if result:

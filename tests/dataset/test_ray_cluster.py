@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from raytac.dataset import DatasetPlan, PressDataset, Presses, RenderJob, ShardResult, render_dataset, verify_dataset
-from raytac.dataset.ray_cluster import render_on_ray
+from raytac.dataset.ray_cluster import _LONGEST_START, render_on_ray
 from raytac.dataset.shard import ShardRecord, ShardStore
 from raytac.errors import BackendError, InputError
 from raytac.specs import SweepSpec
@@ -119,9 +119,8 @@ def test_a_worker_that_dies_each_time_it_comes_back_is_given_up(sweep: SweepSpec
 
     with pytest.raises(BackendError, match="no worker is left"):
         list(render_on_ray(RenderJob(Killer(replace(sweep, count=8)), "cpu", batch=4), range(2), workers=1))
-    assert 3 <= len(deaths.read_text("utf-8")) <= 8, (
-        "one as it rendered, the others as it prepared; Ray counts restarts as retries too"
-    )
+    # One as it rendered, the others as it prepared; Ray counts restarts as retries too, and a busy machine is waited for.
+    assert 3 <= len(deaths.read_text("utf-8")) <= _LONGEST_START  # a restart takes a second at least
 
 
 @pytest.mark.usefixtures("local_ray")

@@ -43,7 +43,8 @@ def run(code: str, folder: Path) -> None:
     (folder / "examples").symlink_to(ROOT / "examples")
     (folder / "page.py").write_text(code, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path]), "MPLBACKEND": "Agg"}
-    result = subprocess.run([sys.executable, "page.py"], cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-m", "tests.case_lights", "page.py"]
+    result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr[-3000:]
 
 

@@ -46,7 +46,7 @@ def test_an_example_fits_on_a_screen_and_says_how_to_run_it(path: Path) -> None:
 def test_an_example_runs(name: str, tmp_path: Path) -> None:
     if name in ("foreign_env", "foreign_robosuite", "gym_env", "own_vector_env", "record_lerobot"):
         pytest.importorskip("gymnasium")
-    command = [sys.executable, str(ROOT / "examples" / f"{name}.py")]
+    command = [sys.executable, "-m", "tests.case_lights", str(ROOT / "examples" / f"{name}.py")]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 0, done.stderr

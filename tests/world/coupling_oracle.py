@@ -7,8 +7,12 @@ from collections.abc import Mapping, Sequence
 import mujoco
 import numpy as np
 
-from raytac.se3 import shifted_wrench
 from tests.world.coupled import Contact
+
+
+def shifted_wrench(wrench: np.ndarray, arm: np.ndarray) -> np.ndarray:
+    """Wrenches (…, 6) about another point; ``arm`` (…, 3) [m] goes from it to the old one."""
+    return np.concatenate([wrench[..., :3], wrench[..., 3:] + np.cross(arm, wrench[..., :3])], axis=-1)
 
 
 def first_step(
