@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from raytac import TactileSensor
+from raytac.calibrate import ball_forces
 from raytac.physics import Ipc, PhysicsConfig, Rigid
 from raytac.specs import available, load_press, load_sensor
 
@@ -32,3 +33,14 @@ def test_they_are_listed_and_lit_in_three_colours() -> None:
         sensor = load_sensor(name)
         assert set(sensor.lights.layers) == {"red", "green", "blue"}
         assert sensor.camera.resolution == (240, 320)
+
+
+def test_the_gel_fitted_to_forces_presses_as_measured() -> None:
+    """Forces published with FEATS of a ball of 7.5 mm radius; the default gel is farther off."""
+    depths, measured = 1e-3 * np.array([0.5, 1.0, 1.5, 2.0]), np.array([1.6503, 5.9641, 13.5257, 23.2532])
+    pads = Rigid(), Ipc(level="coarse")
+    worst = [
+        np.abs(ball_forces(load_sensor(name), pads, 7.5e-3, depths, device="cpu") / measured - 1.0).max(axis=1)
+        for name in ("gelsight_mini_feats", "gelsight_mini")
+    ]
+    assert (worst[0] < 0.08).all() and (worst[1] > 0.15).all()

@@ -90,8 +90,8 @@ def force_table(fits: Sequence[GelFit], best: GelFit, pads: Sequence[str], names
     text += f"\n\nWritten: {TITLES[best.name]}. Errors of the pads with the sensor as written, all depths in view:\n"
     text += "".join(f"\n| {row(pad, values)}" for pad, values in zip(pads, errors, strict=True))
     rig = next((fit for fit in fits if fit.compliance > 0.0), None)
-    if rig is not None and rig.held_out_rms < 2.0 * best.held_out_rms:
-        text += f"\n\nA rig that yields {1e6 * rig.compliance:.1f} µm/N explains the forces about as well: "
+    if rig is not None and rig.held_out_rms < 1.5 * best.held_out_rms:
+        text += f"\n\nA rig that yields {1e6 * rig.compliance:.1f} µm/N explains the forces nearly as well: "
         text += "one ball cannot tell it from the gel."
     return text
 
