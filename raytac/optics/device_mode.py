@@ -20,6 +20,7 @@ from raytac.gel.surface import GelSurface, PadGrid, rounded_envs
 from raytac.optics.base import OpticalMode, OpticsConfig, OpticsImages
 from raytac.optics.camera import Pinhole
 from raytac.optics.geometry import CoatField, CoatLayout, check_view, concave_cover, see, seen_images
+from raytac.optics.host_copy import copy_of
 from raytac.optics.ink import checked_ink
 from raytac.optics.refraction import Slab
 from raytac.optics.runtime import RENDERER, load_mitsuba, no_collection
@@ -212,8 +213,8 @@ class DeviceMode(ABC):
         with RENDERER:
             self._finish()
             # Copies: on the CPU Dr.Jit reads NumPy memory in place, when the kernel runs.
-            ink = None if (checked := checked_ink(surface)) is None else checked.copy()
-            surface = replace(surface, height=surface.height.copy(), contact=surface.contact.copy(), ink=ink)
+            ink = None if (checked := checked_ink(surface)) is None else copy_of(checked)
+            surface = replace(surface, height=copy_of(surface.height), contact=copy_of(surface.contact), ink=ink)
             heights, failed = self._checked(surface)
             pressed = self._pressed(surface, heights, failed)
             whole, dotted = len(pressed) == surface.batch, ink is not None
@@ -250,7 +251,9 @@ class DeviceMode(ABC):
         The others show the image at rest: their gel is untouched, and their dots are where the first pad at rest had them.
         """
         rest = surface.grid.rest.astype(np.float32)
-        differ = failed | surface.contact.any(axis=(1, 2)) | (heights != rest).any(axis=(1, 2))
+        differ = failed | surface.contact.any(axis=(1, 2))
+        for env in np.flatnonzero(~differ):
+            differ[env] = (heights[env] != rest).any()
         if surface.ink is not None and not differ.all():
             if self._rest_ink is None:
                 self._rest_ink = surface.ink[int(np.argmin(differ))].copy()

@@ -92,7 +92,7 @@ class ShadowGrid:
         return -(-self.view[2] // SQUARE), -(-self.view[3] // SQUARE)
 
     def _place(self, mi: Any, i: Any) -> tuple[Any, Any, Any]:
-        """Environment, column and row in view of node ``i``; the nodes of a square follow each other."""
+        """Environment, column and row in view of node ``i``; those of a square follow each other."""
         columns, rows = self._squares
         square, inside = i // SQUARE**2, i % SQUARE**2
         column, row = SQUARE * (square % columns) + inside % SQUARE, SQUARE * ((square // columns) % rows) + inside // SQUARE
