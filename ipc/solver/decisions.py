@@ -101,7 +101,7 @@ def after_lag(tolerance: wp.float64, max_relags: wp.int32, d: Decisions, f: Flag
     d.pending[env] = 0
     if d.active[env] != 0:  # within the first solve, whose end is judged
         d.settled[env] = 0
-        if d.changed[env] <= tolerance:
+        if d.changed[env] <= tolerance and d.worst_changed[env] <= tolerance:
             d.renewed[env] = ENOUGH
         return
     f.settled[0] = 1
@@ -343,7 +343,7 @@ def conclude(
     """End an iteration: environments converge, give up, or have their friction lagged again.
 
     Friction is renewed within a step's first solve after each of its first ``renewals`` Newton iterations, and ``calm_renewals`` times
-    after one of at most ``calm`` [m] with all frames in place.
+    after one of at most ``calm`` [m] with all frames in place; the first says nothing, since friction's curvature at rest holds it back.
     """
     env = wp.tid()
     if f.halt[0] != 0:
@@ -379,7 +379,9 @@ def conclude(
     if friction != 0 and max_relags > 0 and d.plain[env] != 0 and d.active[env] != 0 and d.relags[env] == 0:
         if d.since_lag[env] <= renewals:
             d.pending[env] = 1
-        elif d.progress[env] >= wp.float64(1.0) and d.size[env] <= calm and d.renewed[env] < calm_renewals:
+        elif (
+            d.progress[env] >= wp.float64(1.0) and d.size[env] <= calm and d.renewed[env] < calm_renewals and d.since_lag[env] > 1
+        ):
             d.pending[env] = 1
             d.renewed[env] = d.renewed[env] + 1
     # Where Newton gave up, forces are no better known after another lag; the first two may still help it on.
