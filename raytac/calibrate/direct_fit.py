@@ -235,7 +235,7 @@ class DirectFit:
     def blocks(self, p: LightParameters) -> list[tuple[str, int]]:
         """Name (of ``SIGMA``) of every parameter of the vector's blocks, and how many follow."""
         per_led = [("place", 3), ("aim", 2), ("lobe", 1), ("height", 1), ("length", 1)] * len(p.leds)
-        rest = [("glow", 3), ("gamma", 1), ("stray", 3), ("vignette", 2), ("mix", 6), ("tone", 3)]
+        rest = [("glow", 3), ("gamma", 1), ("stray", 3), ("vignette", 2), ("mix", 6), ("tone", len(MOST_BENT))]
         return [*per_led, ("power", p.power.size), *rest, ("slope", len(self.start.slopes))]
 
     def sigma(self, p: LightParameters) -> np.ndarray:
@@ -266,7 +266,7 @@ class DirectFit:
 
     def at(self, x: np.ndarray, circles: np.ndarray) -> FitState:
         p = self.start.p
-        cuts = np.cumsum([p.leds.size, p.power.size, 3, 6, 6, 3])
+        cuts = np.cumsum([p.leds.size, p.power.size, 3, 6, 6, len(MOST_BENT)])
         leds, power, glow, response, mix, tone, slopes = np.split(x, cuts)
         leds, power = leds.reshape(p.leds.shape), power.reshape(-1, 3)
         changed = dataclasses.replace(p, leds=leds, power=power, glow=glow, response=response, mix=mix, tone=tone)
@@ -330,7 +330,8 @@ class DirectFit:
         (count, wide), slopes = p.leds.shape, len(state.slopes)
         first = p.leds.size + p.power.size
         mixing, unmixed = p.mixing.T, [_powered(p, part) for part in whole.parts]
-        jac = np.zeros((first + 18 + slopes, image.size), np.float32)
+        last = first + 15 + len(p.tone)
+        jac = np.zeros((last + slopes, image.size), np.float32)
         rest_jac = np.zeros((len(jac), rest.size), np.float32)
 
         def column(k: int, *parts: np.ndarray, mixing: np.ndarray = mixing) -> None:
@@ -350,13 +351,11 @@ class DirectFit:
         for k in range(3):
             power = p.power[p.layer == k].sum(0) * self.even_gain
             column(first + k, *(case_light(g)[:, None] * power for g in geometries))
-        steps = [{"response": p.response + step} for step in STEP * np.eye(6)] + [
-            {"tone": p.tone + step} for step in STEP * np.eye(3)
-        ]
-        for k, change in zip((*range(3, 9), *range(15, 18)), steps, strict=True):
-            other, other_rest = self.images(dataclasses.replace(p, **change), total)
-            jac[first + k] = ((other - image) / STEP).ravel()
-            rest_jac[first + k] = ((other_rest - rest) / STEP).ravel()
+        for begin, name in ((first + 3, "response"), (first + 15, "tone")):
+            values = getattr(p, name)
+            for k, step in enumerate(STEP * np.eye(len(values)), begin):
+                other, other_rest = self.images(dataclasses.replace(p, **{name: values + step}), total)
+                jac[k], rest_jac[k] = ((other - image) / STEP).ravel(), ((other_rest - rest) / STEP).ravel()
         for k, (row, other) in enumerate(np.argwhere(OFF_DIAGONAL)):
             column(first + 9 + k, *unmixed, mixing=np.outer(np.eye(3)[other], np.eye(3)[row]))
         by_point, by_normal = (part @ mixing for part in self._by_geometry(p, leds[0]))
@@ -367,7 +366,7 @@ class DirectFit:
             return (gains[0] * change / step).ravel()
 
         for k in range(slopes):
-            jac[first + 18 + k] = moved(state.slopes + STEP * np.eye(slopes)[k], state.circles, STEP)
+            jac[last + k] = moved(state.slopes + STEP * np.eye(slopes)[k], state.circles, STEP)
         circles = np.zeros((image.size, 3), np.float32)
         if self.settings.circles:
             for k in range(3):

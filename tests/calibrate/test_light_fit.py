@@ -204,9 +204,10 @@ def test_a_known_tone_curve_is_found_again(sensor: SensorSpec) -> None:
     errors = [float(np.abs(problem.residuals(state)[0]).mean()) for state in (found, held)]
     assert errors[0] < 0.25 and errors[1] > 2 * errors[0], errors
     seen = np.quantile(shots.presses, [0.01, 0.99])
-    u = np.linspace(*(true.p.curve.extended_straight(seen / 255)), 20)
+    low, high = true.p.curve.straight(seen / 255)
+    u = np.linspace(low, high, 20)
     # A gain of all light is that of all powers: curves are compared at the same middle.
-    scale = np.exp(np.log(found.p.curve.extended_straight(true.p.curve.bent(u)) / u).mean())
+    scale = np.exp(np.log(found.p.curve.straight(true.p.curve.bent(u)) / u).mean())
     np.testing.assert_allclose(found.p.curve.bent(scale * u), true.p.curve.bent(u), atol=0.02)
 
 
