@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from raytac.optics import RayTraced
+from raytac.optics.ink import darkened
 from raytac.optics.response import Response
 from raytac.optics.runtime import load_mitsuba
 from raytac.optics.trace.fast_tracer import total
@@ -62,6 +63,27 @@ def test_device_and_host_encode_alike(tracer: Build, device: str) -> None:
     dr.eval(u8)
     on_device = np.array(u8).reshape(batch.shape)
     assert np.abs(on_device.astype(int) - response.encode_numpy(batch)).max() <= 1
+
+
+@pytest.mark.parametrize("black", [0.0, 0.02])
+def test_a_dot_darkens_light_and_not_levels(black: float) -> None:
+    """Of light x a coat of albedo 0.5 returns with a dot of albedo 0.1 a fifth, whatever gamma and tone curve make of it."""
+    mi, _ = load_mitsuba("cpu")
+    spec = like_a_mini()
+    spec = replace(
+        spec,
+        response=replace(CURVE, black_level=(black,) * 3),
+        coat=replace(spec.coat, reflectance=(0.5,) * 3, specular=0.0),
+        markers=replace(spec.markers, reflectance=0.1),
+    )
+
+    def levels(light: np.ndarray) -> np.ndarray:
+        return np.array([255 * toned(float(x) ** (1 / 1.8)) for x in light + black])
+
+    light = np.linspace(0.05, 0.9, 20)
+    dotted = darkened(spec, [mi.Float(levels(light))] * 3, mi.Float(1.0))
+    for channel in dotted:
+        np.testing.assert_allclose(np.array(channel), levels(0.2 * light), atol=0.05)
 
 
 def background() -> np.ndarray:
