@@ -4,8 +4,9 @@ Residuals are those of the presses with the real background B as flat field, and
 
     I = encode((decode(B) − b) · L(pressed) / L(rest) + b),
 
-solved by Levenberg and Marquardt's method with a prior on every parameter. What direct light lacks (shadows, inter-reflection, a
-specular coat) can be given as ``extra`` light of every LED, with its slopes by the LED's place and size (``ray_fit``).
+with gamma and tone curve in ``encode``, solved by Levenberg and Marquardt's method with a prior on every parameter. What direct light lacks
+(shadows, inter-reflection, a specular coat) can be given as ``extra`` light of every LED, with its slopes by the LED's place and size
+(``ray_fit``).
 """
 
 from __future__ import annotations
@@ -23,17 +24,19 @@ from raytac.calibrate.light_parameters import (
     DARKEST,
     HEIGHT,
     LENGTH,
+    MOST_BENT,
     OFF_DIAGONAL,
     REFERENCE_DISTANCE,
     LightParameters,
     check_mix,
+    check_tone,
     darkest,
     least_mix,
     leds_inside,
     mean_power,
     side_ties,
 )
-from raytac.calibrate.photographs import Photographs, decode, encode
+from raytac.calibrate.photographs import Photographs, decode, encode, level_slope
 from raytac.optics.trace.quadrature import EdgePoints
 from raytac.specs import SensorSpec
 
@@ -49,6 +52,7 @@ SIGMA = {
     "stray": 0.5,
     "vignette": 0.5,
     "mix": 0.1,
+    "tone": 0.2,
     "slope": 0.15,
 }
 """Standard deviation of a parameter about its start [mm, rad, 1].
@@ -121,6 +125,8 @@ class DirectFit:
         """
         if "mix" not in settings.fixed:
             check_mix(sensor, start.p)
+        if "tone" not in settings.fixed:
+            check_tone(start.p)
         self.sensor, self.shots, self.start, self.settings = sensor, shots, start, settings
         small, coarse = shots.shrunk(factor), shots.shrunk(REST_FACTOR)
         height, width = small.background.shape[:2]
@@ -137,7 +143,7 @@ class DirectFit:
         self.rest_share = settings.rest_weight * np.sqrt(len(self.press) / len(self.rest_u))
         native, (cx, cy) = sensor.camera.resolution, sensor.camera.principal_point
         self.r2 = (((self.rest_u - cx) ** 2 + (self.rest_v - cy) ** 2) / (native[0] ** 2 + native[1] ** 2) * 4)[:, None]
-        self.darkest = darkest(shots.background, 1.0)
+        self.darkest = shots.background.reshape(-1, 3).min(0)[None]
         coat = sensor.coat
         diffuse = (1 - coat.specular) * np.array(coat.reflectance)
         self.even_gain = (diffuse + coat.specular) / diffuse
@@ -215,17 +221,22 @@ class DirectFit:
 
     def images(self, p: LightParameters, total: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Levels of the presses' pixels (M, 3) and of the image at rest (K, 3)."""
+        pressed, rest, _ = self._linear(p, total)
+        return encode(pressed, p.response[0], p.curve), encode(rest, p.response[0], p.curve)
+
+    def _linear(self, p: LightParameters, total: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Light [full scales] that is encoded: pressed (M, 3), at rest (K, 3); stray light (3,)."""
         gamma, *stray, a1, a2 = p.response
-        black = np.array(stray) * self.darkest**gamma
+        black = np.array(stray) * darkest(self.darkest, gamma, p.curve)
         pressed, flat, rest = total
-        image = encode((decode(self.behind, gamma) - black) * pressed / flat + black, gamma)
-        return image, encode(rest * (1 + self.r2 * (a1 + a2 * self.r2)) + black, gamma)
+        linear = (decode(self.behind, gamma, p.curve) - black) * pressed / flat + black
+        return linear, rest * (1 + self.r2 * (a1 + a2 * self.r2)) + black, black
 
     def blocks(self, p: LightParameters) -> list[tuple[str, int]]:
         """Name (of ``SIGMA``) of every parameter of the vector's blocks, and how many follow."""
         per_led = [("place", 3), ("aim", 2), ("lobe", 1), ("height", 1), ("length", 1)] * len(p.leds)
-        rest = [("glow", 3), ("gamma", 1), ("stray", 3), ("vignette", 2), ("mix", 6), ("slope", len(self.start.slopes))]
-        return [*per_led, ("power", p.power.size), *rest]
+        rest = [("glow", 3), ("gamma", 1), ("stray", 3), ("vignette", 2), ("mix", 6), ("tone", len(MOST_BENT))]
+        return [*per_led, ("power", p.power.size), *rest, ("slope", len(self.start.slopes))]
 
     def sigma(self, p: LightParameters) -> np.ndarray:
         """Standard deviation of every parameter about its start, (n,)."""
@@ -251,14 +262,14 @@ class DirectFit:
 
     def flat(self, state: FitState) -> np.ndarray:
         p = state.p
-        return np.concatenate([p.leds.ravel(), p.power.ravel(), p.glow, p.response, p.mix, state.slopes])
+        return np.concatenate([p.leds.ravel(), p.power.ravel(), p.glow, p.response, p.mix, p.tone, state.slopes])
 
     def at(self, x: np.ndarray, circles: np.ndarray) -> FitState:
         p = self.start.p
-        cuts = np.cumsum([p.leds.size, p.power.size, 3, 6, 6])
-        leds, power, glow, response, mix, slopes = np.split(x, cuts)
+        cuts = np.cumsum([p.leds.size, p.power.size, 3, 6, 6, len(MOST_BENT)])
+        leds, power, glow, response, mix, tone, slopes = np.split(x, cuts)
         leds, power = leds.reshape(p.leds.shape), power.reshape(-1, 3)
-        changed = dataclasses.replace(p, leds=leds, power=power, glow=glow, response=response, mix=mix)
+        changed = dataclasses.replace(p, leds=leds, power=power, glow=glow, response=response, mix=mix, tone=tone)
         return FitState(changed, slopes, circles)
 
     def inside_bounds(self, state: FitState) -> FitState:
@@ -268,7 +279,7 @@ class DirectFit:
         """
         p, response = state.p, state.p.response.copy()
 
-        def bounded(name: str, values: np.ndarray, least: float | np.ndarray, most: float | None) -> np.ndarray:
+        def bounded(name: str, values: np.ndarray, least: float | np.ndarray, most: float | np.ndarray | None) -> np.ndarray:
             return values if name in self.settings.fixed else np.clip(values, least, most)
 
         length, height = self.sees_sizes()
@@ -277,8 +288,8 @@ class DirectFit:
         response[4:5] = bounded("vignette", response[4:5], -2.0, 0.5)
         response[5:] = bounded("vignette", response[5:], max(-0.3, -0.75 - response[4]), 1.5)
         power, glow = bounded("power", p.power, 0, None), bounded("glow", p.glow, 0, None)
-        mix = bounded("mix", p.mix, least_mix(self.sensor), 0)
-        changed = dataclasses.replace(p, leds=leds, power=power, glow=glow, response=response, mix=mix)
+        mix, tone = bounded("mix", p.mix, least_mix(self.sensor), 0), bounded("tone", p.tone, -MOST_BENT, MOST_BENT)
+        changed = dataclasses.replace(p, leds=leds, power=power, glow=glow, response=response, mix=mix, tone=tone)
         circles = state.circles.copy()
         circles[:, 2] = np.clip(circles[:, 2], 3, None)
         return FitState(changed, state.slopes, circles)
@@ -315,11 +326,12 @@ class DirectFit:
         whole = self._with_extra(p, Light(*(self._led_layers(p, g, part) for g, part in zip(geometries, leds, strict=True))))
         total = _summed(p, whole)
         image, rest = self.images(p, total)
-        gains = self._gains(p, image, rest, total)
+        gains = self._gains(p, total)
         (count, wide), slopes = p.leds.shape, len(state.slopes)
         first = p.leds.size + p.power.size
         mixing, unmixed = p.mixing.T, [_powered(p, part) for part in whole.parts]
-        jac = np.zeros((first + 15 + slopes, image.size), np.float32)
+        last = first + 15 + len(p.tone)
+        jac = np.zeros((last + slopes, image.size), np.float32)
         rest_jac = np.zeros((len(jac), rest.size), np.float32)
 
         def column(k: int, *parts: np.ndarray, mixing: np.ndarray = mixing) -> None:
@@ -339,11 +351,11 @@ class DirectFit:
         for k in range(3):
             power = p.power[p.layer == k].sum(0) * self.even_gain
             column(first + k, *(case_light(g)[:, None] * power for g in geometries))
-        for k in range(6):
-            response = p.response + STEP * np.eye(6)[k]
-            other, other_rest = self.images(dataclasses.replace(p, response=response), total)
-            jac[first + 3 + k] = ((other - image) / STEP).ravel()
-            rest_jac[first + 3 + k] = ((other_rest - rest) / STEP).ravel()
+        for begin, name in ((first + 3, "response"), (first + 15, "tone")):
+            values = getattr(p, name)
+            for k, step in enumerate(STEP * np.eye(len(values)), begin):
+                other, other_rest = self.images(dataclasses.replace(p, **{name: values + step}), total)
+                jac[k], rest_jac[k] = ((other - image) / STEP).ravel(), ((other_rest - rest) / STEP).ravel()
         for k, (row, other) in enumerate(np.argwhere(OFF_DIAGONAL)):
             column(first + 9 + k, *unmixed, mixing=np.outer(np.eye(3)[other], np.eye(3)[row]))
         by_point, by_normal = (part @ mixing for part in self._by_geometry(p, leds[0]))
@@ -354,7 +366,7 @@ class DirectFit:
             return (gains[0] * change / step).ravel()
 
         for k in range(slopes):
-            jac[first + 15 + k] = moved(state.slopes + STEP * np.eye(slopes)[k], state.circles, STEP)
+            jac[last + k] = moved(state.slopes + STEP * np.eye(slopes)[k], state.circles, STEP)
         circles = np.zeros((image.size, 3), np.float32)
         if self.settings.circles:
             for k in range(3):
@@ -370,21 +382,11 @@ class DirectFit:
             by_normal[2] -= 0.5 * p.glow[layer] * self.even_gain * power
         return by_point, by_normal
 
-    def _gains(
-        self, p: LightParameters, image: np.ndarray, rest: np.ndarray, total: list[np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _gains(self, p: LightParameters, total: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Slopes of levels by light pressed, by light at rest (negated), and of the rest image."""
-        gamma, *stray, _, _ = p.response
-        black = np.array(stray) * self.darkest**gamma
-
-        def slope(levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            linear = np.maximum((np.maximum(levels, 0.1) / 255) ** gamma, 1e-6)
-            return levels / gamma / linear, linear
-
-        by_linear, linear = slope(image)
-        lit = by_linear * (linear - black)
-        rest_by, rest_linear = slope(rest)
-        return lit / total[0], lit / total[1], rest_by * (rest_linear - black) / total[2]
+        linear, rest, black = self._linear(p, total)
+        lit, still = (level_slope(light, p.response[0], p.curve) * (light - black) for light in (linear, rest))
+        return lit / total[0], lit / total[1], still / total[2]
 
     def step(self, state: FitState) -> Callable[[float], FitState]:
         """The normal equations at ``state``; the result gives the trial state of any damping."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from raytac.calibrate.imprint import KNOTS, press_surface
-from raytac.calibrate.photographs import Photographs, decode
+from raytac.calibrate.photographs import Photographs, decode, level_slope
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, make_grid
 from raytac.optics.image.config import Phong
@@ -270,14 +270,14 @@ def with_shading(
         )
         raise InputError("lights", value=int((rest <= 0).sum()), rule=rule)
     gamma, black = bare.gamma, np.asarray(bare.black_level)
-    light = decode(background, gamma)
+    light = decode(background, gamma, bare.curve)
     target = light - black
     lit = target > 0
     if (lit.mean((0, 1)) < 0.5).any():
         rule = "more than half of a channel must be brighter than the black level"
         raise InputError("background", value=lit.mean((0, 1)).round(2).tolist(), rule=rule)
-    # d level / d log gain = 255/γ · light^(1/γ − 1) · target
-    slope = np.where(lit, 255 / gamma * np.maximum(light, 1e-6) ** (1 / gamma - 1) * target, 0.0)
+    # d level / d log gain = d level / d light · target
+    slope = np.where(lit, level_slope(light, gamma, bare.curve) * target, 0.0)
     gain = np.where(lit, target, rest) / rest
     red, green, blue = (fit_log_gain(gain[..., c], slope[..., c] ** 2, settings.degree, ridge=settings.ridge) for c in range(3))
     return dataclasses.replace(

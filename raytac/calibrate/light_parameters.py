@@ -18,6 +18,7 @@ from raytac.errors import InputError
 from raytac.optics.trace.quadrature import EdgePoints, quadrature
 from raytac.specs import LedSpec, LightsSpec, SensorSpec
 from raytac.specs.sensor_check import view_edges
+from raytac.specs.tone import STRAIGHT, ToneCurve
 
 CHANNELS = ("red", "green", "blue")
 DARKEST = 0.85
@@ -41,6 +42,8 @@ MOST_MIXED = -0.5
 Both are for light in full scales. Light of several channels from one LED is in its powers."""
 ROUNDED = 1e-3
 """Most that a matrix may begin beyond these bounds: that of a file is rounded."""
+MOST_BENT = np.array([0.4, 0.1, 0.4])
+"""Most of the size of a fitted tone curve's coefficients: with them every curve rises."""
 OFF_DIAGONAL = ~np.eye(3, dtype=bool)
 REFERENCE_DISTANCE = 10e-3
 """Distance [m] at which a power of 1 gives a coat facing the LED full scale."""
@@ -63,10 +66,15 @@ class LightParameters:
     Stray light is over that of the channel's darkest background pixel."""
     mix: np.ndarray
     """(6,): the colour matrix off its diagonal, row by row, for light in full scales."""
+    tone: np.ndarray
+    """(3,): coefficients of the tone curve."""
 
     @classmethod
     def of(cls, sensor: SensorSpec, background: np.ndarray) -> LightParameters:
-        """Parameters of a sensor with this image at rest [levels]; InputError for other layers."""
+        """Parameters of a sensor with this image at rest [levels].
+
+        InputError for other layers, and a tone curve of more coefficients than a fit has.
+        """
         leds, power = [], []
         for led in sensor.lights.leds:
             if led.layer not in CHANNELS:
@@ -77,11 +85,16 @@ class LightParameters:
             leds.append([*(1e3 * c for c in led.position), *aim, led.lobe, 1e3 * led.size[1], 1e3 * led.size[0]])
             power.append(np.array(led.power) * full_scale(sensor))
         response = sensor.response
-        stray = np.clip(np.array(response.black_level) / darkest(background, response.gamma), 0, DARKEST)
+        if len(response.tone) > len(MOST_BENT):
+            raise InputError(
+                "response.tone", value=response.tone, rule=f"must have at most {len(MOST_BENT)} coefficients in a fit"
+            )
+        tone = np.array([*response.tone, *np.zeros(len(MOST_BENT) - len(response.tone))])
+        stray = np.clip(np.array(response.black_level) / darkest(background, response.gamma, response.curve), 0, DARKEST)
         glow = [max((led.glow for led in sensor.lights.leds if led.layer == c), default=0.0) * _GLOW for c in CHANNELS]
         a1, a2, _ = response.vignetting
         at_response, mix = np.array([response.gamma, *stray, a1, a2]), np.array(response.colour_mix) * _mixed_balance(sensor)
-        return cls(sensor.lights, np.array(leds), np.array(power), np.array(glow), at_response, mix)
+        return cls(sensor.lights, np.array(leds), np.array(power), np.array(glow), at_response, mix, tone)
 
     @property
     def mixing(self) -> np.ndarray:
@@ -89,6 +102,11 @@ class LightParameters:
         whole = np.eye(3)
         whole[OFF_DIAGONAL] = self.mix
         return whole
+
+    @property
+    def curve(self) -> ToneCurve:
+        """The tone curve."""
+        return ToneCurve(tuple(self.tone))
 
     @property
     def layer(self) -> np.ndarray:
@@ -167,6 +185,14 @@ def check_mix(sensor: SensorSpec, p: LightParameters) -> None:
         raise InputError("response.colour_mix", value=tuple(float(f"{m:.4g}") for m in p.mix / balance), rule=rule)
 
 
+def check_tone(p: LightParameters) -> None:
+    """InputError for a start whose tone curve lies outside the bounds of a fit of it."""
+    if (np.abs(p.tone) > MOST_BENT + ROUNDED).any():
+        bounds = ", ".join(f"±{most:g}" for most in MOST_BENT)
+        rule = f'must be within {bounds} where a fit of it begins: fix "tone", or begin without a curve'
+        raise InputError("response.tone", value=tuple(float(f"{t:.4g}") for t in p.tone), rule=rule)
+
+
 def mean_power(p: LightParameters) -> float:
     """Mean over LEDs of their power in the channel that they light most [full scales]."""
     return max(float(p.power.max(1).mean()), 1e-6)
@@ -175,19 +201,24 @@ def mean_power(p: LightParameters) -> float:
 def with_parameters(sensor: SensorSpec, p: LightParameters, background: np.ndarray) -> SensorSpec:
     """The sensor with fitted lights and response, unchecked; ``background`` as of ``of``."""
     gamma, *stray, a1, a2 = map(float, p.response)
-    black = np.array(stray) * darkest(background, gamma)
+    black = np.array(stray) * darkest(background, gamma, p.curve)
     black_level = tuple(map(float, black))
     mix = tuple(map(float, p.mix / _mixed_balance(sensor)))
     vignetting = (a1, a2, 0.0)
     response = dataclasses.replace(
-        sensor.response.unshaded, gamma=gamma, black_level=black_level, vignetting=vignetting, colour_mix=mix
+        sensor.response.unshaded,
+        gamma=gamma,
+        black_level=black_level,
+        vignetting=vignetting,
+        colour_mix=mix,
+        tone=tuple(map(float, p.tone)) if p.tone.any() else (),
     )
     return dataclasses.replace(sensor, response=response, lights=p.lights(sensor))
 
 
-def darkest(background: np.ndarray, gamma: float) -> np.ndarray:
+def darkest(background: np.ndarray, gamma: float, curve: ToneCurve = STRAIGHT) -> np.ndarray:
     """Linear light of the darkest pixel of every channel, (3,)."""
-    return np.maximum(decode(background.reshape(-1, 3).min(0), gamma), 1e-6)
+    return np.maximum(decode(background.reshape(-1, 3).min(0), gamma, curve), 1e-6)
 
 
 PLACE, AIM, LOBE, TALL, LONG, POWER = 1.0, 0.2, 1.0, 0.5, 0.5, 0.3

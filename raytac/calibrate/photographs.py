@@ -11,7 +11,10 @@ import numpy as np
 from raytac.calibrate.presses import RealPresses, in_image, read_presses
 from raytac.errors import InputError
 from raytac.specs.sensor import SensorSpec
+from raytac.specs.tone import STRAIGHT, ToneCurve
 
+DARK = 1e-6
+"""Least light [full scales] that is encoded."""
 FAR = 3.0
 """Radii from a contact's centre beyond which a press counts as changing nothing."""
 
@@ -55,14 +58,23 @@ class Photographs:
         return np.hypot(u - x, v - y) / r
 
 
-def encode(linear: np.ndarray, gamma: float) -> np.ndarray:
+def encode(linear: np.ndarray, gamma: float, curve: ToneCurve = STRAIGHT) -> np.ndarray:
     """8-bit levels, not rounded and not cut at 255; the lower end keeps slopes finite."""
-    return 255 * np.maximum(linear, 1e-6) ** (1 / gamma)
+    u = np.maximum(linear, DARK) ** (1 / gamma)
+    return 255 * (u if curve.is_plain else curve.extended(u)[0])
 
 
-def decode(levels: np.ndarray, gamma: float) -> np.ndarray:
+def decode(levels: np.ndarray, gamma: float, curve: ToneCurve = STRAIGHT) -> np.ndarray:
     """Linear full scale of 8-bit levels."""
-    return (levels / 255) ** gamma
+    u = levels / 255
+    return (u if curve.is_plain else curve.extended_straight(u)) ** gamma
+
+
+def level_slope(linear: np.ndarray, gamma: float, curve: ToneCurve = STRAIGHT) -> np.ndarray:
+    """Slope of ``encode`` [levels]; what is darker than ``DARK`` has its slope there."""
+    light = np.maximum(linear, DARK)
+    u = light ** (1 / gamma)
+    return 255 * curve.extended(u)[1] * u / (gamma * light)
 
 
 def photographs_of(presses: RealPresses, sensor: SensorSpec) -> Photographs:

@@ -65,7 +65,7 @@ class Fitted:
 def brightened(problem: DirectFit, state: FitState) -> FitState:
     """The same with powers that give the image at rest its mean in every channel."""
     rest = problem.total(state.p, problem.light(state.p, problem.geometry(state)))[2].mean(0)
-    gain = decode(problem.rest_real, state.p.response[0]).mean(0) / np.maximum(rest, 1e-9)
+    gain = decode(problem.rest_real, state.p.response[0], state.p.curve).mean(0) / np.maximum(rest, 1e-9)
     return dataclasses.replace(state, p=dataclasses.replace(state.p, power=state.p.power * gain))
 
 

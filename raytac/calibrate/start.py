@@ -28,10 +28,11 @@ SPREAD = 1.5
 def with_first_response(sensor: SensorSpec) -> SensorSpec:
     """The sensor with the response that a fit begins from, whatever its file was fitted to.
 
-    Gamma ``GAMMA``, no stray light, the vignette 1 + ``VIGNETTE`` r², no shading or mix; exposure and white balance are the sensor's.
+    Gamma ``GAMMA``, no stray light, the vignette 1 + ``VIGNETTE`` r², no shading, mix or tone curve; exposure and white balance are the
+    sensor's.
     """
     vignetting = (VIGNETTE, 0.0, 0.0)
-    bare = replace(sensor.response.unshaded, black_level=(0.0, 0.0, 0.0), colour_mix=UNMIXED)
+    bare = replace(sensor.response.unshaded, black_level=(0.0, 0.0, 0.0), colour_mix=UNMIXED, tone=())
     plain = replace(bare, gamma=GAMMA, vignetting=vignetting)
     return replace(sensor, response=plain)
 

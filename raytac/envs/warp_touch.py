@@ -22,6 +22,7 @@ from raytac.markers.pattern import MarkerPattern
 from raytac.observe import DeviceImages, ObservationSettings, Randomization, TactileObserver
 from raytac.observe.observer import CellMeans
 from raytac.observe.randomization import response_curves
+from raytac.specs.sensor import ResponseSpec
 from raytac.world.pad_touch import PadTouch
 from raytac.world.warp_world import WarpWorld
 
@@ -258,9 +259,9 @@ def _rows(mask: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
 class WarpCameras:
     """``CameraDrift`` with draws from one generator of the device: cameras of B environments."""
 
-    def __init__(self, randomization: Randomization, gamma: float, num_envs: int, generator: torch.Generator) -> None:
-        """Draw all cameras; ``gamma`` is the exponent of the sensor's camera."""
-        self._settings, self._gamma, self._generator = randomization, gamma, generator
+    def __init__(self, randomization: Randomization, response: ResponseSpec, num_envs: int, generator: torch.Generator) -> None:
+        """Draw all cameras; ``response`` is that of the sensor's camera."""
+        self._settings, self._response, self._generator = randomization, response, generator
         self._curves = torch.zeros((num_envs, 3, 256), dtype=torch.float32, device=generator.device)
         first = 256 * torch.arange(3 * num_envs, dtype=torch.int32, device=generator.device)
         self._first = first.reshape(num_envs, 1, 1, 3)
@@ -271,13 +272,13 @@ class WarpCameras:
         """Cameras of an observer; None if they do not differ."""
         if not observer.randomization.changes_images:
             return None
-        return cls(observer.randomization, observer.sensor.response.gamma, observer.num_envs, generator)
+        return cls(observer.randomization, observer.sensor.response, observer.num_envs, generator)
 
     def begin(self, mask: torch.Tensor) -> None:
         """Draw the cameras of the environments of a mask (B,)."""
         shape, device = (len(self._curves), 5), self._curves.device
         u = torch.rand(shape, generator=self._generator, dtype=torch.float64, device=device)
-        curves = response_curves(2.0 * u - 1.0, self._settings, self._gamma)
+        curves = response_curves(2.0 * u - 1.0, self._settings, self._response)
         self._curves = torch.where(mask[:, None, None], curves.float(), self._curves)
 
     def apply(self, images: torch.Tensor, *, noise: bool = True) -> torch.Tensor:

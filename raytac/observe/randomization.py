@@ -12,7 +12,7 @@ from array_api_compat import array_namespace, device
 from raytac.checks import is_number
 from raytac.errors import InputError
 from raytac.markers import MarkerPerturbation
-from raytac.specs.sensor import SensorSpec
+from raytac.specs.sensor import ResponseSpec, SensorSpec
 from raytac.specs.task import TaskScene
 
 _ABSOLUTE = {"noise": np.inf, "pad_shift": 0.02, "pad_turn": 0.5}
@@ -139,29 +139,32 @@ def randomised_bodies(scene: TaskScene, randomization: Randomization, seed: int)
     return replace(scene, bodies=tuple(bodies))
 
 
-def response_curves(draws: Any, randomization: Randomization, gamma: float) -> Any:
+def response_curves(draws: Any, randomization: Randomization, response: ResponseSpec) -> Any:
     """8-bit values of n cameras by the nominal one's, (n, 3, 256); NumPy or PyTorch.
 
     Args:
         draws: uniform random numbers (n, 5) in [−1, 1): exposure, white balance of three channels, exponent.
-        gamma: exponent of the nominal camera.
+        response: that of the nominal camera; its exponent and tone curve count.
     """
     xp, r = array_namespace(draws), randomization
     gain = (1.0 + r.exposure * draws[:, :1]) * (1.0 + r.white_balance * draws[:, 1:4])
-    exponent = gamma * (1.0 + r.gamma * draws[:, 4])
+    exponent = response.gamma * (1.0 + r.gamma * draws[:, 4])
     level = xp.arange(256, dtype=draws.dtype, device=device(draws)) / 255.0
-    return 255.0 * (gain[:, :, None] * level**gamma) ** (1.0 / exponent[:, None, None])
+    light = gain[:, :, None] * response.curve.straight(level) ** response.gamma
+    encoded = light ** (1.0 / exponent[:, None, None])
+    # White and brighter stays so; the curve is for levels up to it.
+    return 255.0 * xp.where(encoded < 1.0, response.curve.bent(encoded), encoded)
 
 
 class CameraDrift:
     """Cameras of B environments, each with its own exposure, white balance, exponent and noise.
 
-    u8 → 255 (g · (u8 / 255)^γ)^(1 / γ') with g the gains; values above 255 saturate, as in a camera. Each environment has its own random
-    stream, so that its draws do not depend on B.
+    u8 → 255 S((g · S⁻¹(u8 / 255)^γ)^(1 / γ')) with g the gains and S the tone curve; values above 255 saturate, as in a camera. Each
+    environment has its own random stream, so that its draws do not depend on B.
     """
 
     def __init__(self, sensor: SensorSpec, randomization: Randomization, num_envs: int, seed: int) -> None:
-        self._settings, self._gamma = randomization, sensor.response.gamma
+        self._settings, self._response = randomization, sensor.response
         self._streams = [np.random.default_rng((seed + b, 0xCA3)) for b in range(num_envs)]
         self._curves = np.empty((num_envs, 3, 256), np.float32)
         self.reset(range(num_envs))
@@ -175,7 +178,7 @@ class CameraDrift:
         """Draw the cameras of environments."""
         if len(envs):
             draws = np.stack([self._streams[b].uniform(-1.0, 1.0, 5) for b in envs])
-            self._curves[list(envs)] = response_curves(draws, self._settings, self._gamma)
+            self._curves[list(envs)] = response_curves(draws, self._settings, self._response)
 
     def apply(self, images: np.ndarray, *, noise: bool = True, envs: Sequence[int] | None = None) -> np.ndarray:
         """8-bit images (n, H, W, 3) of these cameras; ``noise``: add the noise of a frame.

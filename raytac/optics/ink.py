@@ -44,11 +44,11 @@ def inked_albedo(sensor: SensorSpec, ink: Any) -> list[Any]:
 def darkened(sensor: SensorSpec, levels: list[Any], ink: Any) -> list[Any]:
     """Levels (0-255, three channels) of a plain coat with dots, for modes that know no light.
 
-    In linear light x = (level / 255)^γ less the black level, a dot returns the share ((1 − s) ρ_dot + s q) / ((1 − s) ρ + s q) of what the
-    coat does; q is what the specular lobe, of weight s, sends to the camera beside a white diffuse coat. Channels are not unmixed first, so
-    that with a colour matrix this is exact only where all channels have the same share, as with grey coats.
+    In linear light x = S⁻¹(level / 255)^γ less the black level, a dot returns the share ((1 − s) ρ_dot + s q) / ((1 − s) ρ + s q) of what
+    the coat does; q is what the specular lobe, of weight s, sends to the camera beside a white diffuse coat. Channels are not unmixed
+    first, so that with a colour matrix this is exact only where all channels have the same share, as with grey coats.
     """
-    coat, response, s = sensor.coat, sensor.response, sensor.coat.specular
+    coat, response, s, curve = sensor.coat, sensor.response, sensor.coat.specular, sensor.response.curve
 
     def inked(*levels: Any) -> tuple[Any, ...]:
         result = []
@@ -57,11 +57,11 @@ def darkened(sensor: SensorSpec, levels: list[Any], ink: Any) -> list[Any]:
             share = ((1 - s) * dotted + s * SPECULAR) / ((1 - s) * albedo + s * SPECULAR)
             power: Any = dr.power  # typed as an object in Dr.Jit's stubs
             level = dr.maximum(level, 0)
-            if black == 0:  # the two powers of the level are one another's inverse
+            if black == 0 and curve.is_plain:  # the two powers of the level are one another's inverse
                 result.append(power(share, 1 / response.gamma) * level)
                 continue
-            linear = power(level / 255, response.gamma) - black
-            result.append(power(dr.maximum(black + linear * share, 0), 1 / response.gamma) * 255)
+            linear = power(curve.straight(level / 255), response.gamma) - black
+            result.append(curve.bent(power(dr.maximum(black + linear * share, 0), 1 / response.gamma)) * 255)
         return tuple(result)
 
     # A branch, since powers are dear and dots are few.

@@ -21,9 +21,10 @@ _STEPS = 60
 
 
 class Response:
-    """u8 = 255 · clip(wb · exposure · vignette · shading · M L + black)^(1/γ), rounded.
+    """u8 = 255 · S(clip(wb · exposure · vignette · shading · M L + black)^(1/γ)), rounded.
 
-    M is the colour matrix, wb the white balance. With ``monochrome`` what is clipped is the mean over channels, and all three show it.
+    M is the colour matrix, wb the white balance, S the tone curve. With ``monochrome`` what is clipped is the mean over channels, and all
+    three show it.
     """
 
     def __init__(self, spec: ResponseSpec, camera: Pinhole, *, monochrome: bool = False) -> None:
@@ -38,6 +39,7 @@ class Response:
         """Linear gain per pixel and channel, (H, W, 3); a flat field multiplies it."""
         self.black = np.asarray(spec.black_level, dtype=np.float32)
         self.matrix = np.array(spec.colour_matrix, np.float32)
+        self.curve = spec.curve
         self._mixes = bool((self.matrix != np.eye(3)).any())
 
     def set_flat_field(self, background: np.ndarray, at_rest: np.ndarray) -> None:
@@ -48,7 +50,7 @@ class Response:
             which = f"{dark} of {at_rest.size} values rendered at rest are dark or negative after the colour matrix"
             rule = f"{which}, so no gain makes them bright"
             raise InputError("flat_field", value=background.shape, rule=rule)
-        target = (background.astype(np.float32) / 255) ** self.spec.gamma - self.black
+        target = self.curve.straight(background.astype(np.float32) / 255) ** self.spec.gamma - self.black
         if self.monochrome:  # one gain of the mean, so that channels keep their weights
             self.scale = (self.scale * _grey(target) / _grey(at_rest * self.scale)).astype(np.float32)
             return
@@ -68,7 +70,8 @@ class Response:
         values = [linear[c] * dr.gather(mi.Float, scale[c], pixel) + float(self.black[c]) for c in range(3)]
         if self.monochrome:
             values = [(values[0] + values[1] + values[2]) / 3] * 3
-        out = [dr.power(dr.clip(value, 0, 1), 1 / self.spec.gamma) * 255 + 0.5 for value in values]
+        levels: list[Any] = [dr.power(dr.clip(value, 0, 1), 1 / self.spec.gamma) for value in values]
+        out = [self.curve.bent(u) * 255 + 0.5 for u in levels]
         # One kernel for the whole image; the interleaving one would otherwise trace it once a channel.
         dr.eval(out)
         return mi.UInt8(dr.ravel(mi.Color3f(*out)))
@@ -83,7 +86,7 @@ class Response:
         value = self.mixed(linear) * self.scale + self.black
         if self.monochrome:
             value = np.broadcast_to(_grey(value), value.shape)
-        return (np.clip(value, 0, 1) ** (1 / self.spec.gamma) * 255 + 0.5).astype(np.uint8)
+        return (self.curve.bent(np.clip(value, 0, 1) ** (1 / self.spec.gamma)) * 255 + 0.5).astype(np.uint8)
 
 
 def _grey(values: np.ndarray) -> np.ndarray:
@@ -94,22 +97,22 @@ def _grey(values: np.ndarray) -> np.ndarray:
 def mid_grey_exposure(sensor: SensorSpec, signal: np.ndarray) -> float:
     """Exposure at which the brightest channel's mean at rest is half of full scale.
 
-    e solves max_c mean_p clip(e · s_pc + b_c, 0, 1)^(1/γ) = 1/2 over channels c and pixels p, by bisection. The left side rises with e
+    e solves max_c mean_p S(clip(e · s_pc + b_c, 0, 1)^(1/γ)) = 1/2 over channels c and pixels p, by bisection. The left side rises with e
     where no s is negative, or no b positive; otherwise e may be one of several solutions.
 
     Args:
-        sensor: its response gives γ and the black level b, and names the file of an error.
+        sensor: its response gives γ, the tone curve S and the black level b, and names the file of an error.
         signal: s, the linear image at rest with colour matrix, vignette, shading and white balance at exposure 1, (H, W, 3).
 
     Raises SpecError: the image is not darker than mid-grey at the least exposure, as its black level alone is brighter, or not brighter at
     the largest, as half of it or more is dark or negative after the colour matrix.
     """
-    black, gamma = np.asarray(sensor.response.black_level), sensor.response.gamma
+    black, gamma, curve = np.asarray(sensor.response.black_level), sensor.response.gamma, sensor.response.curve
     if sensor.camera.monochrome:
         signal, black = _grey(signal), _grey(black)
 
     def brightness(exposure: float) -> float:
-        return float((np.clip(exposure * signal + black, 0, 1) ** (1 / gamma)).mean(axis=(0, 1)).max())
+        return float(curve.bent(np.clip(exposure * signal + black, 0, 1) ** (1 / gamma)).mean(axis=(0, 1)).max())
 
     low, high = np.log(_LIMITS)
     if not brightness(_LIMITS[0]) < 0.5 < brightness(_LIMITS[1]):

@@ -64,9 +64,11 @@ ABLATIONS: dict[str, Ablation] = {
     "no_glow": Ablation(sensor=lambda s: _leds(s, glow=0.0), fixed=("glow",)),
     "flat_pad": Ablation(sensor=lambda s: replace(s, gelpad=replace(s.gelpad, dome_radius=(np.inf, np.inf), surface=None))),
     "no_response_curve": Ablation(
-        sensor=lambda s: replace(s, response=replace(s.response, gamma=1.0, black_level=(0.0, 0.0, 0.0))), fixed=("stray",)
+        sensor=lambda s: replace(s, response=replace(s.response, gamma=1.0, black_level=(0.0, 0.0, 0.0), tone=())),
+        fixed=("stray", "tone"),
     ),
     "no_colour_matrix": Ablation(sensor=lambda s: replace(s, response=replace(s.response, colour_mix=UNMIXED)), fixed=("mix",)),
+    "no_tone_curve": Ablation(sensor=lambda s: replace(s, response=replace(s.response, tone=())), fixed=("tone",)),
     "one_led_a_colour": Ablation(sensor=_one_a_colour),
     "rigid_pad_imprint": HELD,
     "one_photograph_at_rest": Ablation(settle=False),

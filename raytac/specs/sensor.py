@@ -18,6 +18,7 @@ from raytac.specs.height_map import HeightMap
 from raytac.specs.lens import Lens
 from raytac.specs.marker_motion import MarkerMotionSpec
 from raytac.specs.toml import ANY, Flag, Integer, Number, Schema, Text, check_fields
+from raytac.specs.tone import ToneCurve
 
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
@@ -73,6 +74,7 @@ SENSOR_SCHEMA: Final[dict[str, Schema]] = {
         "black_level": Number("[-0.5, 0.5]", length=3, default=(0.0, 0.0, 0.0)),
         "vignetting": Number("[-10, 10]", length=3, default=(0.0, 0.0, 0.0)),
         "colour_mix": Number("[-1, 1]", length=6, default=UNMIXED),
+        "tone": Number("[-1, 1]", length=ANY, default=()),
         "shading_red": Number("[-5, 5]", length=ANY, default=()),
         "shading_green": Number("[-5, 5]", length=ANY, default=()),
         "shading_blue": Number("[-5, 5]", length=ANY, default=()),
@@ -268,7 +270,7 @@ class CameraSpec:
 
 @dataclass(frozen=True)
 class ResponseSpec:
-    """u8 = 255 · clip(wb · exposure · vignette · shading · M L + black)^(1/γ) of a radiance L."""
+    """u8 = 255 S(clip(wb · exposure · vignette · shading · M L + black)^(1/γ)) of radiance L."""
 
     exposure: float | Literal["auto"]
     """Gain from radiance [W/(m² sr), relative] to full scale 1; ``AUTO``: rest is mid-grey.
@@ -285,6 +287,8 @@ class ResponseSpec:
     colour_mix: tuple[float, ...] = UNMIXED
     """Numbers off the diagonal of M, the colour matrix, row by row; those on it are 1.
     Red of the image takes the first two of green's and blue's light. They are negative where a camera makes colours more saturated."""
+    tone: tuple[float, ...] = ()
+    """Coefficients t_k of S, the tone curve (``ToneCurve``); none is S(u) = u."""
     shading_red: tuple[float, ...] = ()
     """Colour shading, a smooth gain of red over the image: exp Σ c_ij T_i(x) T_j(y), i + j ≤ n.
     T: Chebyshev's polynomials; x, y: −1 to 1 over the image's width and height; in the order c_00, c_01 … c_0n, c_10 …:
@@ -307,6 +311,11 @@ class ResponseSpec:
         """M, row by row."""
         rg, rb, gr, gb, br, bg = self.colour_mix
         return (1.0, rg, rb), (gr, 1.0, gb), (br, bg, 1.0)
+
+    @property
+    def curve(self) -> ToneCurve:
+        """S."""
+        return ToneCurve(self.tone)
 
     @property
     def shading(self) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:

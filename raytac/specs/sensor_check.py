@@ -11,6 +11,7 @@ from raytac.specs.height_map import HeightMap
 from raytac.specs.lens import Lens
 from raytac.specs.sensor import LedSpec, SensorSpec, Vec3, shading_degree
 from raytac.specs.toml import in_mm
+from raytac.specs.tone import LEAST_SLOPE
 
 _COEFFICIENT = 5.0
 """Most that a coefficient of a colour shading may be, as in the file."""
@@ -34,16 +35,17 @@ def validate_sensor(sensor: SensorSpec) -> None:
     Raises:
         SpecError: the dome is deeper than the pad, or a map of its surface does not cover the pad, rises above the case, or falls below
             the bonded face; the camera lies in the gel, outside the case, or sees past the pad; its
-            distortion has no inverse, or its tilt is too large; the vignette leaves no light; colour shading has a wrong number of
-            coefficients or might overflow; markers lie off the pad; an LED lies in the gel, above the dome, or outside the case, a
-            virtual one above the dome, in the camera's view or where light refracts; with ``refraction.model = "slab"``, camera or LED do
-            not lie below the slab's face to the air.
-            The message names the file that the sensor or its lights came from, the key, and the value in the unit of the file.
+            distortion has no inverse, or its tilt is too large; the vignette leaves no light; the tone curve falls; colour shading has a
+            wrong number of coefficients or might overflow; markers lie off the pad; an LED lies in the gel, above the dome, or outside the
+            case, a virtual one above the dome, in the camera's view or where light refracts; with ``refraction.model = "slab"``, camera or
+            LED do not lie below the slab's face to the air. The message names the file that the sensor or its lights came from, the key,
+            and the value in the unit of the file.
     """
     _check_dome(sensor)
     check_slab(sensor)
     _check_camera(sensor)
     _check_vignetting(sensor)
+    _check_tone(sensor)
     _check_shading(sensor)
     _check_markers(sensor)
     for index, led in enumerate(sensor.lights.leds):
@@ -211,6 +213,12 @@ def _check_vignetting(sensor: SensorSpec) -> None:
     if min(1 + s * (a1 + s * (a2 + s * a3)) for s in (farthest**2, *lowest)) <= 0:
         rule = "1 + a1 r² + a2 r⁴ + a3 r⁶ must stay above 0 over the whole image"
         raise _error(sensor, "response.vignetting", list(sensor.response.vignetting), rule)
+
+
+def _check_tone(sensor: SensorSpec) -> None:
+    if (least := sensor.response.curve.least_slope) < LEAST_SLOPE:
+        rule = f"the tone curve's least slope between black and white is {least:.3g}: must be at least {LEAST_SLOPE:g}"
+        raise _error(sensor, "response.tone", list(sensor.response.tone), rule)
 
 
 def _check_shading(sensor: SensorSpec) -> None:

@@ -185,6 +185,8 @@ def response_text(response: ResponseSpec) -> str:
     ]
     if response.colour_mix != UNMIXED:
         lines.append(f"colour_mix = {row(response.colour_mix)}")
+    if response.tone:
+        lines.append(f"tone = {row(response.tone)}")
     for channel, coefficients in zip(("red", "green", "blue"), response.shading, strict=True):
         if not coefficients:
             continue

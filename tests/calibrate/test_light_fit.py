@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from raytac.calibrate.direct_fit import SIGMA, DirectFit, FitSettings, FitState
 from raytac.calibrate.direct_light import ExtraLight, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
-from raytac.calibrate.light_parameters import HEIGHT, LENGTH, LightParameters, side_ties, with_parameters
+from raytac.calibrate.light_parameters import HEIGHT, LENGTH, MOST_BENT, LightParameters, side_ties, with_parameters
 from raytac.calibrate.photographs import Photographs, encode
 from raytac.calibrate.prior_choice import choose_strength
 from raytac.calibrate.ray_fit import extra_light, fit_lights, refine_circles
@@ -20,10 +21,13 @@ from raytac.gel.surface import GelSurface, make_grid
 from raytac.optics import RayTraced
 from raytac.specs import SensorSpec, load_sensor, with_lights
 from raytac.specs.sensor_check import validate_sensor
+from raytac.specs.tone import LEAST_SLOPE, ToneCurve
 
 RADIUS = 3.155e-3
 MIX = np.array([-0.04, -0.06, -0.02, -0.05, -0.03, -0.04])
 """A colour matrix off its diagonal, for a white balance of 1."""
+TONE = np.array([0.2, -0.05, 0.3])
+"""A tone curve."""
 NOISE = 1.5
 """Noise of a synthetic pixel [levels]."""
 
@@ -58,18 +62,21 @@ def traced(sensor: SensorSpec, at: np.ndarray, noise: float = 0.0) -> Photograph
     return Photographs(levels(GelSurface.at_rest(grid))[0], images, at, np.full(len(at), RADIUS))
 
 
-def direct(sensor: SensorSpec, at: np.ndarray, mix: np.ndarray | None = None) -> tuple[Photographs, FitState]:
+def direct(
+    sensor: SensorSpec, at: np.ndarray, mix: np.ndarray | None = None, tone: np.ndarray | None = None
+) -> tuple[Photographs, FitState]:
     """Photographs by direct light alone, even over squares of 4 px, and the state that made them: no stray light, no vignette."""
     blank = Photographs(np.full((240, 320, 3), 100.0), np.full((len(at), 240, 320, 3), 100.0), at, np.full(len(at), RADIUS))
     p = LightParameters.of(sensor, blank.background)
     mix = np.zeros(6) if mix is None else mix
-    p = dataclasses.replace(p, response=np.array([1.4, 0.0, 0.0, 0.0, 0.0, 0.0]), mix=mix)
+    tone = np.zeros(3) if tone is None else tone
+    p = dataclasses.replace(p, response=np.array([1.4, 0.0, 0.0, 0.0, 0.0, 0.0]), mix=mix, tone=tone)
     state = FitState(p, RIGID_PAD.copy(), at)
     every = DirectFit(sensor, blank, state, FitSettings(reach=99.0, samples=(10**6, 10**6)), factor=4)
     pressed, flat, _ = every.total(state.p, every.light(state.p, every.geometry(state)))
     small, presses = np.empty((60, 80, 3)), np.empty((len(at), 60, 80, 3))
-    small[every.row, every.column] = encode(flat, 1.4)
-    presses[every.press, every.row, every.column] = encode(pressed, 1.4)
+    small[every.row, every.column] = encode(flat, 1.4, p.curve)
+    presses[every.press, every.row, every.column] = encode(pressed, 1.4, p.curve)
     background, images = small.repeat(4, 0).repeat(4, 1), presses.repeat(4, 1).repeat(4, 2)
     return dataclasses.replace(blank, background=background, presses=images), state
 
@@ -95,7 +102,7 @@ def with_sizes(sensor: SensorSpec, sizes: list[tuple[float, float]]) -> SensorSp
 @pytest.mark.parametrize("kind", SIZES)
 def test_derivatives_agree_with_finite_differences(sensor: SensorSpec, kind: str) -> None:
     shots, state = direct(with_sizes(sensor, SIZES[kind]), circles(6))
-    p = dataclasses.replace(state.p, response=np.array([1.4, 0.3, 0.4, 0.5, -0.3, 0.05]), mix=MIX)
+    p = dataclasses.replace(state.p, response=np.array([1.4, 0.3, 0.4, 0.5, -0.3, 0.05]), mix=MIX, tone=TONE)
     state = dataclasses.replace(state, p=p)
     problem = DirectFit(sensor, shots, state, FitSettings(samples=(40, 40)), factor=4)
     plain, rng = problem.light(p, problem.geometry(state)), np.random.default_rng(4)
@@ -165,11 +172,11 @@ def test_a_known_colour_matrix_is_found_again(sensor: SensorSpec) -> None:
     assert errors[1] > 5 * errors[0], "powers of LEDs, which are positive, cannot stand for it"
 
 
-def test_the_ray_tracer_mixes_colours_as_the_fit_does(sensor: SensorSpec) -> None:
-    """Its images of a sensor with a colour matrix and a white balance: direct light with that matrix explains them, without it not."""
+def test_the_ray_tracer_mixes_and_bends_colours_as_the_fit_does(sensor: SensorSpec) -> None:
+    """Its images of a sensor with matrix, tone curve and white balance: direct light with these explains them, without one not."""
     leds = tuple(dataclasses.replace(led, glow=0.0) for led in sensor.lights.leds)
     balanced = dataclasses.replace(sensor.response, black_level=(0.0, 0.0, 0.0), white_balance=(1.2, 0.8, 1.0))
-    response = dataclasses.replace(balanced, colour_mix=tuple(MIX))
+    response = dataclasses.replace(balanced, colour_mix=tuple(MIX), tone=tuple(TONE))
     mixed = with_lights(dataclasses.replace(sensor, response=response), dataclasses.replace(sensor.lights, leds=leds))
     at, grid = circles(2), make_grid(sensor.gelpad, 0.12e-3)
     tracer = RayTraced(bounce=False, shadows=False).build(mixed, device="cpu")
@@ -178,11 +185,46 @@ def test_the_ray_tracer_mixes_colours_as_the_fit_does(sensor: SensorSpec) -> Non
     assert pressed is not None and rest is not None
     shots = Photographs(rest[0].astype(float), pressed.astype(float), at, np.full(2, RADIUS))
     state, errors = FitState(LightParameters.of(mixed, shots.background), RIGID_PAD.copy(), at), []
-    for mix in (state.p.mix, np.zeros(6)):
-        own = dataclasses.replace(state, p=dataclasses.replace(state.p, mix=mix))
+    for changed in ({}, {"mix": np.zeros(6)}, {"tone": np.zeros(3)}):
+        own = dataclasses.replace(state, p=dataclasses.replace(state.p, **changed))
         problem = DirectFit(mixed, shots, own, FitSettings(samples=(400, 200)), factor=2)
         errors.append(float(np.abs(problem.residuals(own)[0][problem.inside]).mean()))
-    assert errors[0] < 0.5 and errors[1] > 3 * errors[0], errors
+    assert errors[0] < 0.5 and min(errors[1:]) > 3 * errors[0], errors
+
+
+def test_a_known_tone_curve_is_found_again(sensor: SensorSpec) -> None:
+    """From LEDs moved by 1 mm and a straight curve: the curve to 0.02 of full scale where the images have levels."""
+    shots, true = direct(sensor, circles(6), tone=TONE)
+    moved = true.p.leds + np.random.default_rng(1).normal(size=true.p.leds.shape) * [1, 1, 1, 0.1, 0.1, 0.4, 0, 0]
+    start = dataclasses.replace(true, p=dataclasses.replace(true.p, leds=moved, tone=np.zeros(3)))
+    settings = FitSettings(fixed=("gamma", "stray", "slope", "mix"), samples=(150, 100))
+    problem = DirectFit(sensor, shots, start, settings, factor=4)
+    found, held = problem.solve(start, 80), problem.with_fixed("tone").solve(start, 80)
+    assert not held.p.tone.any()
+    errors = [float(np.abs(problem.residuals(state)[0]).mean()) for state in (found, held)]
+    assert errors[0] < 0.25 and errors[1] > 2 * errors[0], errors
+    seen = np.quantile(shots.presses, [0.01, 0.99])
+    low, high = true.p.curve.straight(seen / 255)
+    u = np.linspace(low, high, 20)
+    # A gain of all light is that of all powers: curves are compared at the same middle.
+    scale = np.exp(np.log(found.p.curve.straight(true.p.curve.bent(u)) / u).mean())
+    np.testing.assert_allclose(found.p.curve.bent(scale * u), true.p.curve.bent(u), atol=0.02)
+
+
+def test_fitted_tone_curves_rise_and_longer_ones_are_refused(sensor: SensorSpec) -> None:
+    """At the corners of the bounds; a start beyond them is refused, and one of four coefficients."""
+    for signs in itertools.product((-1, 0, 1), repeat=3):
+        curve = ToneCurve(tuple(signs * MOST_BENT))
+        assert curve.least_slope >= LEAST_SLOPE - 1e-9, curve
+    shots, true = direct(sensor, circles(2))
+    beyond = dataclasses.replace(true, p=dataclasses.replace(true.p, tone=np.array([0.5, 0.0, -0.7])))
+    with pytest.raises(InputError, match=r"response\.tone = .*0\.5.*±0\.4, ±0\.1, ±0\.4.*fix \"tone\""):
+        DirectFit(sensor, shots, beyond, FitSettings(samples=(60, 40)), factor=4)
+    problem = DirectFit(sensor, shots, true, FitSettings(samples=(60, 40)), factor=4)
+    np.testing.assert_array_equal(problem.inside_bounds(beyond).p.tone, [0.4, 0.0, -0.4])
+    long = dataclasses.replace(sensor, response=dataclasses.replace(sensor.response, tone=(0.1, 0.0, 0.0, 0.1)))
+    with pytest.raises(InputError, match=r"response\.tone.*at most 3"):
+        LightParameters.of(long, shots.background)
 
 
 @pytest.mark.slow
@@ -373,7 +415,7 @@ def test_the_prior_that_serves_presses_elsewhere_best_is_chosen(sensor: SensorSp
     shots, true = direct(sensor, circles(8))
     moved = dataclasses.replace(true.p, leds=true.p.leds + np.array([3.0, 0, 0, 0, 0.3, 0, 0, 0]))
     start = with_parameters(sensor, moved, shots.background)
-    settings = FitSettings(fixed=("gamma", "slope", "stray", "mix"))
+    settings = FitSettings(fixed=("gamma", "slope", "stray", "mix", "tone"))
     found, errors = choose_strength(start, shots, settings, candidates={"tied-dark": {"prior": 1e7}, "free": {"prior": 30.0}})
     assert found == "free" and errors["free"] < 0.6 * errors["tied-dark"], "a clear difference beats custom"
     usual = {"tied-dark": {"prior": 30.0}, "free": {"prior": 60.0}}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -211,6 +213,15 @@ def test_cameras_differ_between_environments_and_repeat_by_seed() -> None:
     gain = 1.0 + 0.2 * np.random.default_rng((3, 0xCA3)).uniform(-1.0, 1.0, 5)[0]
     assert drift.apply(images[:1])[0, 0, 0, 0] == int(100 * gain ** (1.0 / SENSOR.response.gamma) + 0.5)
     np.testing.assert_array_equal(CameraDrift(SENSOR, Randomization(), B, 0).apply(images), images)
+    # Under a tone curve too, and what is brighter than white saturates.
+    bent = replace(SENSOR, response=replace(SENSOR.response, tone=(0.3, -0.1, 0.4)))
+    curve, u = bent.response.curve, np.arange(256) / 255
+    every = np.arange(256, dtype=np.uint8)[None, :, None, None].repeat(3, 3)
+    np.testing.assert_array_equal(CameraDrift(bent, Randomization(), 1, 0).apply(every), every)
+    linear = gain * curve.straight(u) ** bent.response.gamma
+    expected = 255 * curve.bent(np.minimum(linear, 1) ** (1 / bent.response.gamma))
+    seen = CameraDrift(bent, Randomization(exposure=0.2), 1, 3).apply(every)[0, :, 0, 0]
+    assert np.abs(seen - expected).max() <= 0.51 and np.abs(seen - u * 255).max() > 3
     noisy = CameraDrift(SENSOR, Randomization(noise=3.0), B, 0).apply(np.full((B, 64, 64, 3), 100, np.uint8))
     assert noisy.std() == pytest.approx(3.0, rel=0.03) and noisy.mean() == pytest.approx(100.0, abs=0.1)
     # What an environment draws does not depend on how many there are, and reseeding restarts its stream.

@@ -1,4 +1,4 @@
-"""The colour matrix wherever light becomes an image: monochrome cameras, flat field, exposure, advice, shading, and what it leaves dark."""
+"""Colour matrix and tone curve wherever light becomes an image: monochrome cameras, flat field, exposure, advice, shading, darkness."""
 
 from __future__ import annotations
 
@@ -21,18 +21,20 @@ from raytac.optics.runtime import load_mitsuba
 from raytac.optics.trace.fast_tracer import with_exposure
 from raytac.specs import SensorSpec
 from raytac.specs.sensor import AUTO
+from raytac.specs.tone import ToneCurve
 from tests.optics.scenes import PITCH, RESOLUTION
 from tests.optics.test_exposure import exposed
 
 MIX = (-0.03, 0.2, 0.25, -0.02, 0.3, 0.1)
 MATRIX = np.array([[1, -0.03, 0.2], [0.25, 1, -0.02], [0.3, 0.1, 1]])
+TONE = (0.3, -0.1, 0.4)
 TRACING = RayTraced(bounce=False, shadows=False)
 TARGET = np.array([120.0, 100.0, 90.0])
 
 
 def mixed(exposure: float | str = 12.0, *, monochrome: bool = False, **response: object) -> SensorSpec:
-    """A small sensor with a colour matrix."""
-    sensor = exposed(exposure, colour_mix=MIX, **response)
+    """A small sensor with a colour matrix and a tone curve."""
+    sensor = exposed(exposure, colour_mix=MIX, tone=TONE, **response)
     return replace(sensor, camera=replace(sensor.camera, monochrome=monochrome))
 
 
@@ -90,7 +92,7 @@ def test_a_monochrome_camera_shows_the_mean_of_mixed_channels() -> None:
     spec, light = sensor.response, np.random.default_rng(0).uniform(0, 0.4, (*RESOLUTION[::-1], 3)).astype(np.float32)
     response = Response(spec, Pinhole.from_spec(sensor.camera, RESOLUTION), monochrome=True)
     value = (3.0 * np.array(spec.white_balance) * (light @ MATRIX.T) + spec.black_level).mean(-1, keepdims=True)
-    expected = 255 * np.clip(value, 0, 1) ** (1 / spec.gamma)
+    expected = 255 * ToneCurve(TONE).bent(np.clip(value, 0, 1) ** (1 / spec.gamma))
     host = response.encode_numpy(light)
     assert np.abs(host - expected).max() <= 0.51 and host.std() > 10
     channels = [mi.Float(np.ascontiguousarray(light[..., c]).ravel()) for c in range(3)]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from raytac.optics import RayTraced
+from raytac.optics.ink import darkened
 from raytac.optics.response import Response
 from raytac.optics.runtime import load_mitsuba
 from raytac.optics.trace.fast_tracer import total
@@ -23,7 +24,13 @@ CURVE = ResponseSpec(
     black_level=(0.01, 0.02, 0.0),
     vignetting=(-0.3, 0.1, -0.05),
     colour_mix=(-0.02, 0.03, 0.1, -0.1, 0.05, -0.2),
+    tone=(0.3, -0.1, 0.4),
 )
+
+
+def toned(u: float) -> float:
+    w = 2 * u - 1
+    return u + u * (1 - u) * (0.3 - 0.1 * w + 0.4 * (1.5 * w * w - 0.5))
 
 
 def linear_image(shape: tuple[int, ...] = (60, 80, 3)) -> np.ndarray:
@@ -40,14 +47,15 @@ def test_the_formula(tracer: Build) -> None:
         vignette = 1 - 0.3 * r**2 + 0.1 * r**4 - 0.05 * r**6
         for c in range(3):
             value = CURVE.white_balance[c] * CURVE.gain * vignette * mixed[row, column, c] + CURVE.black_level[c]
-            expected = 255 * min(max(value, 0), 1) ** (1 / 1.8)
+            expected = 255 * toned(min(max(value, 0), 1) ** (1 / 1.8))
             assert abs(float(encoded[row, column, c]) - expected) <= 0.51, (row, column, c)
     assert (encoded == 255).any()  # clipped, not wrapped around
-    assert Response(CURVE, camera).encode_numpy(np.full_like(image, -0.3)).max() <= 255 * 0.02 ** (1 / 1.8) + 1
+    assert Response(CURVE, camera).encode_numpy(np.full_like(image, -0.3)).max() <= 255 * toned(0.02 ** (1 / 1.8)) + 1
 
 
-def test_device_and_host_encode_alike(tracer: Build) -> None:
-    mi, _ = load_mitsuba("cpu")
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def test_device_and_host_encode_alike(tracer: Build, device: str) -> None:
+    mi, _ = load_mitsuba(device)
     response = Response(CURVE, tracer(like_a_mini()).camera)
     batch = linear_image((2, 60, 80, 3))
     channels = [mi.Float(np.ascontiguousarray(batch[..., c]).ravel()) for c in range(3)]
@@ -55,6 +63,27 @@ def test_device_and_host_encode_alike(tracer: Build) -> None:
     dr.eval(u8)
     on_device = np.array(u8).reshape(batch.shape)
     assert np.abs(on_device.astype(int) - response.encode_numpy(batch)).max() <= 1
+
+
+@pytest.mark.parametrize("black", [0.0, 0.02])
+def test_a_dot_darkens_light_and_not_levels(black: float) -> None:
+    """Of light x a coat of albedo 0.5 returns with a dot of albedo 0.1 a fifth, whatever gamma and tone curve make of it."""
+    mi, _ = load_mitsuba("cpu")
+    spec = like_a_mini()
+    spec = replace(
+        spec,
+        response=replace(CURVE, black_level=(black,) * 3),
+        coat=replace(spec.coat, reflectance=(0.5,) * 3, specular=0.0),
+        markers=replace(spec.markers, reflectance=0.1),
+    )
+
+    def levels(light: np.ndarray) -> np.ndarray:
+        return np.array([255 * toned(float(x) ** (1 / 1.8)) for x in light + black])
+
+    light = np.linspace(0.05, 0.9, 20)
+    dotted = darkened(spec, [mi.Float(levels(light))] * 3, mi.Float(1.0))
+    for channel in dotted:
+        np.testing.assert_allclose(np.array(channel), levels(0.2 * light), atol=0.05)
 
 
 def background() -> np.ndarray:

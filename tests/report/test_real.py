@@ -404,9 +404,12 @@ def test_a_calibration_of_markers_by_unknown_names_writes_nothing(name: str, sai
     assert said in str(told.value) and not list(tmp_path.iterdir())
 
 
-def test_the_fit_without_a_colour_matrix_has_none_whatever_the_sensor_has() -> None:
-    response = dataclasses.replace(SENSOR.response, colour_mix=(-0.1,) * 6)
-    own, ablation = dataclasses.replace(SENSOR, response=response), ABLATIONS["no_colour_matrix"]
+@pytest.mark.parametrize(
+    ("name", "without", "block"), [("no_colour_matrix", {"colour_mix": UNMIXED}, "mix"), ("no_tone_curve", {"tone": ()}, "tone")]
+)
+def test_the_fit_without_matrix_or_curve_has_none_whatever_the_sensor_has(name: str, without: dict[str, Any], block: str) -> None:
+    response = dataclasses.replace(SENSOR.response, colour_mix=(-0.1,) * 6, tone=(0.1, 0.0, 0.2))
+    own, ablation = dataclasses.replace(SENSOR, response=response), ABLATIONS[name]
     changed = ablation.sensor(own)
-    assert changed == dataclasses.replace(own, response=dataclasses.replace(response, colour_mix=UNMIXED))
-    assert ablation.fixed == ("mix",), "it stays so in the fit"
+    assert changed == dataclasses.replace(own, response=dataclasses.replace(response, **without))
+    assert ablation.fixed == (block,), "it stays so in the fit"

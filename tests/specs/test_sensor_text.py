@@ -29,7 +29,7 @@ def same(sensor: SensorSpec, back: SensorSpec) -> bool:
 @pytest.mark.parametrize("name", available("sensor"))
 def test_a_shipped_sensor_is_named_as_base_and_another_is_written_as_a_whole(name: str, tmp_path: Path) -> None:
     shipped = load_sensor(name)
-    response = replace(shipped.response, colour_mix=(-0.1, -0.02, 0.0, 0.3, -0.25, 0.0))
+    response = replace(shipped.response, colour_mix=(-0.1, -0.02, 0.0, 0.3, -0.25, 0.0), tone=(0.2, -0.05))
     sensor = replace(shipped, optics=OpticsSpec(shadows=False), response=response)
     assert sensor_files(sensor)["sensor.toml"].startswith(f'base = "{name}"\n')
     assert same(sensor, written(sensor, tmp_path / "based"))
