@@ -252,8 +252,8 @@ class DeviceMode(ABC):
         """
         rest = surface.grid.rest.astype(np.float32)
         differ = failed | surface.contact.any(axis=(1, 2))
-        for env in np.flatnonzero(~differ):
-            differ[env] = (heights[env] != rest).any()
+        untouched = np.flatnonzero(~differ)
+        differ[untouched] = (heights[untouched] != rest).any(axis=(1, 2))
         if surface.ink is not None and not differ.all():
             if self._rest_ink is None:
                 self._rest_ink = surface.ink[int(np.argmin(differ))].copy()
