@@ -15,7 +15,6 @@ MEASURED = (
     "optics/test_glow.py",
     "optics/test_layers.py",
     "regression/",
-    "report/test_real.py",
 )
 """Folders and files of ``tests`` that measure images: these fit with all paths, the others with ``FEW``."""
 FEW = 1 << 15

@@ -15,6 +15,7 @@ import trimesh
 import raytac
 from raytac import learn
 from raytac.cli import COMMANDS, main
+from raytac.cli.press import PressArgs
 from raytac.io.metrics import read_metrics
 from raytac.specs import load_sensor
 
@@ -121,6 +122,18 @@ def test_the_overview_is_one_line_a_command_and_fits_a_screen(capsys: pytest.Cap
         with pytest.raises(SystemExit):
             main(args)
         assert word in capsys.readouterr().err
+
+
+def test_the_force_of_a_press_has_no_negative_zero(caplog: pytest.LogCaptureFixture) -> None:
+    figures = {
+        "contact.max_indentation_mm": 0.7,
+        "contact.force_x_n": -1e-4,
+        "contact.force_y_n": 0.0,
+        "contact.force_z_n": -1.996,
+    }
+    with caplog.at_level(logging.INFO, "raytac"):
+        PressArgs(scene="coin")._log_result(figures)
+    assert "force on the pad 0.00, 0.00, -2.00 N" in caplog.text
 
 
 def interrupted(*_: object, **__: object) -> None:

@@ -134,7 +134,7 @@ class PressArgs(ShadowOptions, SolverOptions):
         """Log the greatest indentation, and the force if it is among the outputs."""
         text = f"indentation up to {metrics['contact.max_indentation_mm']:.3f} mm"
         if "contact.force_z_n" in metrics:
-            x, y, z = (metrics[f"contact.force_{axis}_n"] for axis in "xyz")
+            x, y, z = (round(float(metrics[f"contact.force_{axis}_n"]), 2) + 0.0 for axis in "xyz")  # no -0.00
             text += f"; force on the pad {x:.2f}, {y:.2f}, {z:.2f} N along x, y, z (z points out of the gel)"
         logging.getLogger("raytac").info(text)
 

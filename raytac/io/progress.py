@@ -67,7 +67,8 @@ class Progress(tqdm):
     def _write_line(self) -> None:
         self.last_print_t, self._written = self._now(), self.n
         elapsed, done = self.last_print_t - self.start_t, self.n - self.initial
-        text = f"{self.desc} {self.n}{f'/{self.total}' if self.total else ''} {self.unit}, {self.format_interval(elapsed)}"
+        unit = self.unit if (self.total or self.n) == 1 else self.unit + ("es" if self.unit.endswith("s") else "s")
+        text = f"{self.desc} {self.n}{f'/{self.total}' if self.total else ''} {unit}, {self.format_interval(elapsed)}"
         if self.total and 0 < self.n < self.total and done > 0:
             text += f", about {self.format_interval((self.total - self.n) * elapsed / done)} to go"
         self.fp.write(f"{text}: {self.postfix}\n" if self.postfix else f"{text}\n")

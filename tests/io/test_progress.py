@@ -41,8 +41,8 @@ def test_long_work_writes_a_line_every_few_seconds(clock: Clock) -> None:
     for _ in Progress(range(60), desc="compare", unit="row", file=log):
         clock.now += 1.0
     lines = log.getvalue().splitlines()
-    assert lines[0] == "compare 5/60 row, 00:05, about 00:55 to go"
-    assert lines[-1] == "compare 60/60 row, 01:00"
+    assert lines[0] == "compare 5/60 rows, 00:05, about 00:55 to go"
+    assert lines[-1] == "compare 60/60 rows, 01:00"
     assert len(lines) == 12 and not set("\r\x1b") & set(log.getvalue())
 
 
@@ -62,16 +62,20 @@ def test_steps_of_unknown_number_say_what_they_are_at_no_oftener_than_others(clo
             bar.update()
             bar.set_postfix_str(f"cost {step}")
     lines = log.getvalue().splitlines()
-    assert len(lines) == 4 and lines[0].startswith("calibrate 251 step, 00:05: cost 249")
+    assert len(lines) == 4 and lines[0].startswith("calibrate 251 steps, 00:05: cost 249")
 
 
 def test_a_loop_of_slow_steps_writes_one_line_a_step(clock: Clock) -> None:
     log = io.StringIO()
-    with Progress(desc="fits", total=3, unit="fit", file=log) as bar:
+    with Progress(desc="boxes", total=3, unit="press", file=log) as bar:
         for _ in range(3):
             clock.now += 100.0
             bar.update()
-    assert [line.split(",")[0] for line in log.getvalue().splitlines()] == ["fits 1/3 fit", "fits 2/3 fit", "fits 3/3 fit"]
+    assert [line.split(",")[0] for line in log.getvalue().splitlines()] == [
+        "boxes 1/3 presses",
+        "boxes 2/3 presses",
+        "boxes 3/3 presses",
+    ]
 
 
 def test_a_terminal_gets_a_bar(clock: Clock) -> None:

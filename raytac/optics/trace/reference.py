@@ -87,7 +87,7 @@ def accumulate(
     per_launch = max(1, min(spp, LAUNCH // (width * height)))
     template = mi.load_dict({"type": "independent"})
     total, done = np.zeros(()), 0
-    with Progress(total=spp, unit="spp", desc="path tracing", show=progress, leave=False) as bar:
+    with Progress(total=spp, unit="sample", desc="path tracing", show=progress, leave=False) as bar:
         while done < spp:
             count = min(per_launch, spp - done)
             n = width * height * count
