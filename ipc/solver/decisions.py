@@ -81,7 +81,7 @@ def choose_lagging(d: Decisions, f: Flags):
 
 
 @wp.kernel
-def after_lag(tolerance: wp.float64, max_relags: wp.int32, d: Decisions, f: Flags):
+def after_lag(tolerance: wp.float64, max_relags: wp.int32, still: wp.float64, d: Decisions, f: Flags):
     """Minimise (again) where friction is new or changed by more than the tolerance.
 
     From half of all renewals on only the sum of the limits has to settle: Newton's tolerance may leave open how a light contact divides it
@@ -106,8 +106,10 @@ def after_lag(tolerance: wp.float64, max_relags: wp.int32, d: Decisions, f: Flag
         return
     f.settled[0] = 1
     # Renewed where it was only calm, friction of a light body may be off by more than a share of the sum of all forces says.
-    # So the forces on every body have to hold, or another solve has to show it.
-    if d.relags[env] > 0 or (d.relags[env] == 0 and (d.renewed[env] == 0 or d.worst_changed[env] <= tolerance)):
+    # So the forces on every body have to hold, and the last step has to be short against the slip (``still``, in m), or there is another
+    # solve.
+    holds = d.renewed[env] == 0 or (d.worst_changed[env] <= tolerance and d.size[env] <= still)
+    if d.relags[env] > 0 or (d.relags[env] == 0 and holds):
         if d.changed[env] <= tolerance or (2 * d.relags[env] >= max_relags and d.sum_changed[env] <= tolerance):
             return
     if d.relags[env] >= max_relags:

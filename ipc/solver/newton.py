@@ -45,6 +45,8 @@ _RENEWALS = 20
 """Most renewals of friction within a step's first solve, where every body is held."""
 _CALM, _CALM_RENEWALS = 10.0, 6
 """Longest Newton step [ε] before a renewal where a body is free, and most of these."""
+_STILL = 0.1
+"""Longest last Newton step [ε] of a solve whose forces are taken without another one."""
 
 
 class Newton:
@@ -268,7 +270,9 @@ class Newton:
             d = state.decisions
             changes = d.changed, d.worst_changed, d.sum_changed
             pot.collision.lag(d.relags, d.lagging, changes, guarded=self._calm_renewals > 0)
-            state.launch(decisions.after_lag, self.settings.friction_tolerance, self.settings.friction_relags)
+            settings = self.settings
+            still = _STILL * settings.friction_slip
+            state.launch(decisions.after_lag, settings.friction_tolerance, settings.friction_relags, still)
             wp.capture_if(state.flags.average, pot.collision.average, share=d.share, active=d.averaging)
             wp.capture_if(state.flags.settled, pot.collision.undo_lag, active=d.settled)
 

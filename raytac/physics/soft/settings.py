@@ -122,7 +122,7 @@ class SceneSettings(_Settings):
     """Relative residual of the linear solve: a grasped body must follow far below ``slip``."""
     forcing: float = 1e-2
     """The same of the other linear solves, as long as the step is large."""
-    substeps: SubstepLimits = SubstepLimits()
+    substeps: SubstepLimits = SubstepLimits(step=2e-4, turn=0.07, most=32)
     """Division of steps near contact."""
 
 
