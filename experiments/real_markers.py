@@ -361,7 +361,7 @@ def draw_residuals(path: Path, drag: Drag, circle: np.ndarray, residuals: dict[s
     for k, (name, residual) in enumerate(residuals.items()):
         axes = figure.add_subplot(rows, columns, k + 1)
         arrows = axes.quiver(*drag.before.T, *residual.T, angles="xy", scale_units="xy", scale=3.0, width=0.004)
-        axes.quiverkey(arrows, 0.85, 1.04, 60.0, "60 µm")
+        axes.quiverkey(arrows, 0.85, 1.04, 60.0, "60 µm", labelpos="E")
         angle = np.linspace(0.0, 2.0 * np.pi, 181)
         axes.plot(circle[0] + circle[2] * np.cos(angle), circle[1] + circle[2] * np.sin(angle), lw=0.8, color="tab:red")
         axes.set(xlim=(0, drag.size[0]), ylim=(drag.size[1], 0), aspect="equal", title=f"{name}: {_rms(residual):.1f} µm")
