@@ -11,9 +11,12 @@ imprint is as wide; and the ball's own motion, a displacement and a turn, by the
 constant: a displacement that is the same for all dots (a gel that slides in its case), by least squares, and taken off the ball's motion.
 
 - ``markers.dots``, ``.lost``, ``.size_um``: dots compared and lost, root mean square of their motion; ``.ball_um``, ``.turn_deg``.
+- ``markers.MODEL.under_um``, ``….outside_um``: root mean square distance of dots under the ball, and of the others.
+- ``markers.layers.…`` with ``--layers``: the ball's motion from the rings of its printed layers (``layer_motion``): of its lowest point
+  and its centre, roll, and the rings' correlation with and without a roll. No model is told these.
 - ``markers.MODEL.rms_um``, ``….share``: root mean square distance of model and photographs, and over ``size_um``; ``….along_um`` of its
-  component along the ball's motion alone, ``….outside_um`` of the dots that are not under the ball.
-- ``markers.MODEL.constant.…``: the same with a constant, ``….x_um`` and ``….y_um`` its value.
+  component along the ball's motion alone.
+- ``markers.MODEL.constant.…``: the same with a constant, ``….x_um`` and ``….y_um`` its value. ``residuals.png`` shows what remains.
 
 ``--vary NAME=A,B,…`` gives the gelpad each of some values, one property of ``VARIED``, with a constant. The value that is best on one half
 of the dots, every other one, is tested on the other half, whose dots had no part in it, nor in the constant:
@@ -35,6 +38,7 @@ import numpy as np
 import tyro
 from scipy import ndimage
 
+from experiments.layer_motion import layer_motion
 from experiments.running import recorded, run
 from raytac.calibrate import PressedBall, pressed_balls
 from raytac.checks import check_number
@@ -54,6 +58,7 @@ STEPS = 4
 """States of each of press and drag."""
 VARIED: dict[str, Callable[[GelpadSpec, str], GelpadSpec]] = {
     "friction": lambda gel, value: replace(gel, friction=float(value)),
+    "poisson_ratio": lambda gel, value: replace(gel, poisson_ratio=float(value)),
     "thickness_mm": lambda gel, value: replace(gel, thickness=1e-3 * float(value)),
     "size": lambda gel, value: replace(gel, size=(float(value) * gel.size[0], float(value) * gel.size[1])),
     "bonded": lambda gel, value: replace(gel, bonded=value),
@@ -81,6 +86,8 @@ class Args(CommonOptions):
     """Level of the soft pad that surface tracking needs."""
     sensor: str = "gelsight_mini"
     """Sensor whose gelpad and marker motion are used."""
+    layers: bool = False
+    """Also read the motion of a printed ball from the rings of its layers."""
     vary: str = ""
     """Property of the gelpad and its values, as friction=0.3,0.5,1; see the module's text. None if empty."""
 
@@ -94,6 +101,8 @@ class Drag:
     lost: int
     size: tuple[int, int]
     """Width and height of the photographs [px]."""
+    images: tuple[np.ndarray, ...] = ()
+    """Both photographs, (H, W, 3) each."""
 
     @property
     def motion(self) -> np.ndarray:
@@ -116,7 +125,7 @@ class Drag:
         if seen.sum() < 3:
             raise InputError("data", value=str(folder), rule="must show at least three dots in both photographs")
         height, width = images[0].shape[:2]
-        return cls(before[seen], after[seen], int((~seen).sum()), (width, height))
+        return cls(before[seen], after[seen], int((~seen).sum()), (width, height), tuple(images))
 
 
 def _places(path: Path) -> np.ndarray:
@@ -306,7 +315,7 @@ def main(args: Args) -> None:
                 metrics |= chosen_by_halves(drag, pads, model, name, own, pitch_um)
         return
     dragged = Dragged(sensor, ball, radius, args.level, device)
-    with recorded(args, "real_markers", device=device) as (_, metrics):
+    with recorded(args, "real_markers", device=device) as (folder, metrics):
         size = _rms(drag.motion) * pitch_um
         metrics |= {"markers.dots": len(drag.before), "markers.lost": drag.lost, "markers.size_um": size}
         metrics |= {"markers.ball_um": float(np.hypot(*own[0])) * pitch_um, "markers.turn_deg": float(np.degrees(own[1]))}
@@ -315,6 +324,11 @@ def main(args: Args) -> None:
             "markers.dots_under_ball": int(under.sum()),
             "markers.level": args.level,
         }
+        if args.layers:
+            figures = layer_motion(drag.images[0], drag.images[1], circle, args.ball_radius_mm / args.pitch_mm).figures(pitch_um)
+            metrics |= {f"markers.layers.{name}": value for name, value in figures.items()}
+            print("layers: " + ", ".join(f"{name} {value:.4g}" for name, value in figures.items()), flush=True)
+        residuals = {}
         axis = own[0] / np.hypot(*own[0])
         print(
             "| model | RMS [µm] | along the drag | share | with a constant: RMS [µm] | along the drag | share | constant [µm] |"
@@ -326,11 +340,32 @@ def main(args: Args) -> None:
                 difference, constant = compared(drag, dragged, markers_config(name), own, with_constant)
                 rms, along = _rms(difference) * pitch_um, _rms((difference @ axis)[:, None]) * pitch_um
                 metrics |= {f"{key}.rms_um": rms, f"{key}.along_um": along, f"{key}.share": rms / size}
-                metrics[f"{key}.outside_um"] = _rms(difference[~under]) * pitch_um
+                metrics |= {
+                    f"{key}.{part}_um": _rms(difference[m]) * pitch_um for part, m in (("under", under), ("outside", ~under))
+                }
                 cells += [f"{rms:.1f}", f"{along:.1f}", f"{rms / size:.3f}"]
             metrics |= {f"{key}.{name_of}_um": float(c) * pitch_um for name_of, c in zip("xy", constant, strict=True)}
+            residuals[name] = difference * pitch_um
             cells.append(", ".join(f"{c * pitch_um:.0f}" for c in constant))
             print(f"| {name} | {' | '.join(cells)} |", flush=True)
+        draw_residuals(folder / "residuals.png", drag, circle, residuals)
+
+
+def draw_residuals(path: Path, drag: Drag, circle: np.ndarray, residuals: dict[str, np.ndarray]) -> None:
+    """Arrows of what photographs have over each model with its constant [µm], at the dots of the first photograph."""
+    from matplotlib.figure import Figure
+
+    columns = min(len(residuals), 3)
+    rows = -(-len(residuals) // columns)
+    figure = Figure(figsize=(5.2 * columns, 4.2 * rows), layout="constrained")
+    for k, (name, residual) in enumerate(residuals.items()):
+        axes = figure.add_subplot(rows, columns, k + 1)
+        arrows = axes.quiver(*drag.before.T, *residual.T, angles="xy", scale_units="xy", scale=3.0, width=0.004)
+        axes.quiverkey(arrows, 0.85, 1.04, 60.0, "60 µm", labelpos="E")
+        angle = np.linspace(0.0, 2.0 * np.pi, 181)
+        axes.plot(circle[0] + circle[2] * np.cos(angle), circle[1] + circle[2] * np.sin(angle), lw=0.8, color="tab:red")
+        axes.set(xlim=(0, drag.size[0]), ylim=(drag.size[1], 0), aspect="equal", title=f"{name}: {_rms(residual):.1f} µm")
+    figure.savefig(path, dpi=110)
 
 
 def pressed_ball(sensor: SensorSpec, circle: np.ndarray, radius: float, device: str) -> PressedBall:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from experiments import real_force, real_markers
+from experiments.layer_motion import layer_motion
 from raytac.calibrate import ball_forces, modulus_factor
 from raytac.errors import InputError
 from raytac.io.images import write_png
@@ -71,6 +72,33 @@ def test_ratios_that_no_gel_has_are_refused(tmp_path: Path) -> None:
         real_force.main(real_force.Args(data=data, radius_mm=5.0, levels="", poisson_ratios="0.6", device="cpu"))
 
 
+def test_a_rolling_balls_motion_is_read_from_its_layers(dots: np.ndarray) -> None:
+    """Rings of a tilted ball that moves and rolls, under dots that do not go along."""
+    radius, centre = 50.0, np.array([150.0, 118.0])
+    lowest, roll = np.array([-2.0, 9.0]), np.array([-0.05, 0.06])
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
+
+    def rings(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        height = np.sqrt(np.maximum(radius**2 - x**2 - y**2, 0.0))
+        axis = np.array([0.25, -0.1, 0.963])
+        layer = (axis[0] * x + axis[1] * y + axis[2] * height) / 2.5
+        return np.where(x**2 + y**2 < (0.75 * radius) ** 2, 6.0 * np.cos(2.0 * np.pi * layer), 0.0)
+
+    x, y = u - centre[0], v - centre[1]
+    before, px, py = rings(x, y), x, y
+    for _ in range(30):  # where each pixel of the second photograph was in the first
+        s = np.sqrt(np.maximum(radius**2 - px**2 - py**2, 0.0)) - radius
+        px, py = x - lowest[0] - roll[0] * s, y - lowest[1] - roll[1] * s
+    one, two = (np.clip(photograph(dots) + field[..., None], 0, 255).astype(np.uint8) for field in (before, rings(px, py)))
+    motion = layer_motion(one, two, np.array([*centre, 36.0]), radius)
+    np.testing.assert_allclose(motion.lowest, lowest, atol=0.25)
+    np.testing.assert_allclose(motion.roll, roll, atol=0.015)
+    np.testing.assert_allclose(motion.centre, lowest - radius * roll, atol=0.8)
+    assert motion.correlation > motion.without_roll + 0.005
+    figures = motion.figures(50.0)
+    assert figures["lowest_y_um"] == pytest.approx(450.0, abs=8.0) and figures["roll_y_deg"] == pytest.approx(3.4, abs=0.9)
+
+
 UNKNOWN = ("vary", "colour=1,2"), ("vary", "friction=1"), ("vary", "friction=a,b"), ("vary", "bonded=back,glue")
 """Variations of the gelpad that are refused."""
 
@@ -129,11 +157,13 @@ def test_a_model_recovers_its_own_drag_with_its_constant(tmp_path: Path, dots: n
         "pitch_mm": PITCH,
         "device": "cpu",
     }
-    real_markers.main(real_markers.Args(data=data, models="fots,force_field", out=tmp_path / "run", **args))
+    real_markers.main(real_markers.Args(data=data, models="fots,force_field", layers=True, out=tmp_path / "run", **args))
     metrics = read_metrics(tmp_path / "run" / "metrics.json")
     assert (metrics["markers.dots"], metrics["markers.lost"]) == (len(dots), 0)
     assert metrics["markers.ball_um"] == pytest.approx(1e3 * PITCH * np.hypot(*(DRAG + CONSTANT)), rel=0.03)
     assert metrics["markers.turn_deg"] == pytest.approx(1.0, abs=0.4)
+    assert (tmp_path / "run" / "residuals.png").stat().st_size > 10_000
+    assert float(metrics["markers.layers.correlation"]) < 1.0  # a ball without layers: read, and of no use
     fots = {key: float(metrics[f"markers.fots.{key}"]) for key in ("rms_um", "constant.rms_um", "constant.x_um", "constant.y_um")}
     assert fots["constant.rms_um"] < 8.0 < 50.0 < fots["rms_um"]
     np.testing.assert_allclose((fots["constant.x_um"], fots["constant.y_um"]), 1e3 * PITCH * CONSTANT, atol=6.0)
