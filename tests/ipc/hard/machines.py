@@ -104,10 +104,13 @@ def squeeze_out(setup: Setup) -> Worst:
 
 
 def falls_on(setup: Setup, bed: ipc.TriMesh, soft: bool, mesh: ipc.TetMesh | None = None, young: float = 5e4) -> Worst:
-    """A ball of 12 mm, or a mat, falls by a millimetre onto what is sharp; it carries the weight in the end."""
+    """A ball of 12 mm, or a mat, falls by a millimetre onto what is sharp; it carries the weight in the end.
+
+    A ball may stand on an edge until rounding tips it: the steps suffice for it to come to rest again.
+    """
     mesh = mesh or moved(ball(6e-3), (0.3e-3, 0.2e-3, 7e-3))
     bodies = [solid("ball", mesh, soft, young), ipc.KinematicBody("bed", bed)]
-    worst = run(world_of(bodies, setup, friction=0.5, kappa=1e6, velocity_tolerance=FINE), 90)
+    worst = run(world_of(bodies, setup, friction=0.5, kappa=1e6, velocity_tolerance=FINE), 130)
     return carries(worst, "bed", G * mass(mesh))
 
 
