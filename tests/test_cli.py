@@ -153,7 +153,7 @@ def test_ctrl_c_in_a_training_says_where_it_goes_on(
 ) -> None:
     monkeypatch.setitem(vars(learn), "train_policies", interrupted)  # the real one needs PyTorch
     assert main(["train", "--out", str(tmp_path)]) == 130
-    kept = f"each training's last checkpoint is kept in {tmp_path}; the same command goes on from there"
+    kept = f"checkpoints that were written are kept in {tmp_path}; the same command goes on from there"
     assert capsys.readouterr().err == f"raytac: interrupted; {kept}\n"
 
 

@@ -78,6 +78,10 @@ class GelFit:
     """Error of each pad at each depth with the values that the other depths give, (P, N).
 
 It is the force over the measured one, less 1."""
+    at_end: bool = False
+    """Poisson's ratio or compliance lies at an end of what was tried.
+
+The best one may lie beyond."""
 
     @property
     def held_out_rms(self) -> float:
@@ -93,13 +97,15 @@ def ball_scene(radius: float, depth: float) -> PressScene:
 def pressed_forces(pad: Pad, depths: np.ndarray) -> np.ndarray:
     """Normal force [N] at each of ``depths`` [m], ascending.
 
-    Raises ``RaytacError``: the physics marks a state as failed.
+    Raises ``RaytacError``: the physics marks a state as failed, or the ball is not felt.
     """
     forces = []
     for depth in depths:
         (reading,) = pad.follow(StageSpec("indent", depth=float(depth)))
         if reading.failed.any() or (reading.unconverged is not None and reading.unconverged.any()):
             raise RaytacError(f"the press to {1e3 * depth:g} mm did not converge")
+        if not reading.wrench[0, 2]:
+            raise RaytacError(f"the press to {1e3 * depth:g} mm is not felt: leave this depth out")
         forces.append(float(reading.wrench[0, 2]))
     return np.abs(forces)
 
@@ -179,7 +185,8 @@ def fits_of(presses: Mapping[float, np.ndarray], own: float, table: ForceTable, 
             for pad, force in enumerate(forces[best] if compliances[best] == 0.0 else presses[own]):
                 held_out[pad, k] = _with_rig(force, table.depth, factor, compliances[best], k) / table.force[k] - 1.0
         best, factor = _best(forces, table.force, np.ones(len(table.depth), bool))
-        fits.append(GelFit(name, factor * youngs_modulus, float(ratios[best]), float(compliances[best]), held_out))
+        at_end = len(forces) > 1 and best in ((len(forces) - 1,) if name == "compliance" else (0, len(forces) - 1))
+        fits.append(GelFit(name, factor * youngs_modulus, float(ratios[best]), float(compliances[best]), held_out, at_end))
     return fits
 
 

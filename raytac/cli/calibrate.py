@@ -75,7 +75,7 @@ class CalibrateArgs(FitOptions, SolverOptions):
             return self._forces(start)
         sensor = load_sensor(self.sensor)
         out = self.folder("calibrate", "markers", sensor.name + ("-quick" if self.quick else ""))
-        with kept_if_interrupted(f"finished presses are kept in {out}"):
+        with kept_if_interrupted(f"presses that are finished are kept in {out}"):
             written = run_calibrate_markers(
                 sensor, out, level=self.level, quick=self.quick, device=self.device, seed=self.seed, start=start
             )

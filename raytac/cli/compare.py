@@ -61,7 +61,7 @@ class CompareArgs(SolverOptions):
         settings = self.settings()
         settings.check()
         self.prepare_warp()
-        with kept_if_interrupted(f"finished rows are kept in {out}"):
+        with kept_if_interrupted(f"rows that are finished are kept in {out}"):
             so_far = partial(self._write, out=out, start=start)
             written = so_far(run_comparison(settings, out, report=so_far))
         return print_paths(written)

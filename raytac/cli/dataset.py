@@ -93,7 +93,7 @@ class DatasetArgs(SolverOptions):
         fps = self._checked_fps()
         if self.export is not None:
             check_export(self.export, out, plan.sweep)
-        with kept_if_interrupted(f"finished shards are kept in {out}"):
+        with kept_if_interrupted(f"shards that are finished are kept in {out}"):
             report = render_dataset(
                 plan,
                 out,

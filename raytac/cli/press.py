@@ -13,6 +13,7 @@ from typing import Annotated
 import tyro
 
 from raytac.cli.shared import ShadowOptions, SolverOptions, chosen_physics, named, print_paths
+from raytac.errors import InputError
 from raytac.frame import OUTPUTS
 from raytac.io.metrics import Metric, read_metrics
 from raytac.io.options import parse_outputs, parse_resolution
@@ -123,6 +124,10 @@ class PressArgs(ShadowOptions, SolverOptions):
             markers=self.markers,
             noise=self.noise,
         )
+        if self.background is not None and self.noise:
+            raise InputError(
+                "background", value=self.background, rule="cannot be together with noise: a photograph has grain of its own"
+            )
         # Presses that differ in physics or optics do not replace each other.
         others = [name for name in (PHYSICS.name_of(physics), self.optics) if name not in ("rigid", "raytrace")]
         out = self.folder("press", "-".join([scene.name, *others]))

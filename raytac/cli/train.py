@@ -37,6 +37,6 @@ class TrainArgs(PpoSettings):
 
         quiet_warp(not self.verbose)
         out = self.out or Path("runs", "train", self.task if self.physics == "rigid" else f"{self.task}_{self.physics}")
-        with kept_if_interrupted(f"each training's last checkpoint is kept in {out}"):
+        with kept_if_interrupted(f"checkpoints that were written are kept in {out}"):
             train_policies(settings, out, device=self.device)
         return print_paths([out / "metrics.json"])

@@ -15,7 +15,7 @@ from raytac.optics.backgrounds import shown_on
 class RandomBackground:
     """Transform that shows a sample's ``rgb`` on one of several photographs.
 
-    The image becomes photograph · rgb / rest_rgb, which is the same ratio in linear light, and ``rest_rgb`` the photograph, so that
+    The image becomes photograph · rgb / rest_rgb, near the same ratio of light, and ``rest_rgb`` the photograph, so that
     differences stay differences. A video keeps one photograph. ``raytac press --background`` shows one press so.
 
     .. code-block:: python

@@ -16,8 +16,9 @@ _DARKEST = 4
 def shown_on(photograph: np.ndarray, rgb: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """Images (…, H, W, 3) as they would be where the image at rest is ``photograph``, uint8.
 
-    In linear light, the photograph times the ratio of the press to the pad at rest. As a camera encodes light by a power, its exponent
-    cancels: photograph · rgb / rest in 8-bit values, which saturate as a camera does. Where ``rgb`` is ``rest``, it is the photograph.
+    The photograph times the ratio of the press to the pad at rest, in 8-bit values, which saturate as a camera does. Where a camera
+    encodes light by a power, this is the ratio of light, since the exponent cancels; with a black level or a tone curve it is near.
+    Where ``rgb`` is ``rest``, it is the photograph.
     """
     gain = photograph.astype(np.float32) / np.maximum(rest, _DARKEST)
     shown = np.clip(rgb * gain + np.float32(0.5), 0.0, 255.0).astype(np.uint8)

@@ -60,8 +60,10 @@ def darkened(sensor: SensorSpec, levels: list[Any], ink: Any) -> list[Any]:
             if black == 0 and curve.is_plain:  # the two powers of the level are one another's inverse
                 result.append(power(share, 1 / response.gamma) * level)
                 continue
-            linear = power(curve.straight(level / 255), response.gamma) - black
-            result.append(curve.bent(power(dr.maximum(black + linear * share, 0), 1 / response.gamma)) * 255)
+            u = level / 255
+            linear = power(dr.select(u < 1, curve.straight(u), u), response.gamma) - black
+            u = power(dr.maximum(black + linear * share, 0), 1 / response.gamma)
+            result.append(dr.select(u < 1, curve.bent(u), u) * 255)  # the curve is for levels up to white
         return tuple(result)
 
     # A branch, since powers are dear and dots are few.

@@ -71,7 +71,9 @@ class Response:
         if self.monochrome:
             values = [(values[0] + values[1] + values[2]) / 3] * 3
         levels: list[Any] = [dr.power(dr.clip(value, 0, 1), 1 / self.spec.gamma) for value in values]
-        out = [self.curve.bent(u) * 255 + 0.5 for u in levels]
+        if not self.curve.is_plain:  # rounding may pass black or white
+            levels = [dr.clip(self.curve.bent(u), 0, 1) for u in levels]
+        out = [level * 255 + 0.5 for level in levels]
         # One kernel for the whole image; the interleaving one would otherwise trace it once a channel.
         dr.eval(out)
         return mi.UInt8(dr.ravel(mi.Color3f(*out)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import os
 import time
+import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,9 @@ from raytac.specs.sensor_file import gelpad_files, load_sensor
 FORCE_PADS = ("rigid", *PADS)
 """Pads that forces can be fitted on: the rigid one, and levels of the soft one."""
 TITLES = {"modulus": "modulus", "poisson_ratio": "modulus and Poisson's ratio", "compliance": "modulus and a rig that yields"}
+POOR = 0.2
+"""Error of force from which a fit is called poor."""
+END = "\nIts Poisson's ratio lies at an end of what was tried."
 FILES = ("sensor.toml", "surface.csv", "metrics.json")
 
 
@@ -44,6 +48,7 @@ def run_calibrate_forces(
     table, radius = ForceTable.read(data), 0.5e-3 * diameter_mm
     if sensor.source is None:
         raise InputError("sensor", value=sensor.name, rule="must have been read from a file, which the fitted one is built on")
+    check_apart(sensor.source, Path(out))
     names = [f"{1e3 * depth:g}" for depth in table.depth]
     solver = resolve_device(device, ray_tracing=False)
     physics: list[PhysicsConfig] = [Rigid() if pad == "rigid" else Ipc(level=pad) for pad in pads]
@@ -72,6 +77,18 @@ def run_calibrate_forces(
     return written
 
 
+def check_apart(source: Path, out: Path) -> None:
+    """InputError if ``out`` holds the sensor's file ``source``, or one that it is built on."""
+    folder, file = out.resolve(), source.resolve()
+    while True:
+        if file.parent == folder:
+            raise InputError("out", value=str(out), rule=f"must be another folder: the sensor is read from {file.name} in it")
+        base = tomllib.loads(file.read_text("utf-8")).get("base")
+        if base is None:
+            return
+        file = find_file("sensor", base, base=file.parent).resolve()
+
+
 def force_table(fits: Sequence[GelFit], best: GelFit, pads: Sequence[str], names: Sequence[str], errors: np.ndarray) -> str:
     """Errors at held-out depths of every fit, and of the sensor as written, in Markdown."""
     lines = [
@@ -85,14 +102,18 @@ def force_table(fits: Sequence[GelFit], best: GelFit, pads: Sequence[str], names
 
     for fit in fits:
         head = f"| {TITLES[fit.name]} | {fit.youngs_modulus / 1e3:.0f} | {fit.poisson_ratio:.3f} | {1e6 * fit.compliance:.1f} | "
+        if fit.at_end:
+            head = head.replace(TITLES[fit.name], f"{TITLES[fit.name]}, at an end of what is tried", 1)
         lines += [head + row(pad, values) for pad, values in zip(pads, fit.held_out, strict=True)]
     text = "Errors of force at each depth, with values fitted to the other depths:\n\n" + "\n".join(lines)
     text += f"\n\nWritten: {TITLES[best.name]}. Errors of the pads with the sensor as written, all depths in view:\n"
     text += "".join(f"\n| {row(pad, values)}" for pad, values in zip(pads, errors, strict=True))
     rig = next((fit for fit in fits if fit.compliance > 0.0), None)
     if rig is not None and rig.held_out_rms < 1.5 * best.held_out_rms:
-        text += f"\n\nA rig that yields {1e6 * rig.compliance:.1f} µm/N explains the forces nearly as well: "
-        text += "one ball cannot tell it from the gel."
+        how = "better" if rig.held_out_rms < best.held_out_rms else "nearly as well"
+        text += f"\n\nA rig that yields {1e6 * rig.compliance:.1f} µm/N explains the forces {how}: one ball cannot tell it from the gel."
+    if best.at_end or np.abs(errors).max() > POOR:
+        text += "\n\nDo not use this gel: its fit is poor, or its Poisson's ratio lies at an end of what is tried."
     return text
 
 
@@ -102,6 +123,7 @@ def _fit_metrics(fit: GelFit, pads: Sequence[str], names: Sequence[str]) -> dict
         f"{key}.youngs_modulus_kpa": fit.youngs_modulus / 1e3,
         f"{key}.poisson_ratio": fit.poisson_ratio,
         f"{key}.compliance_um_per_n": 1e6 * fit.compliance,
+        f"{key}.at_end": int(fit.at_end),
         f"{key}.held_out_rms": fit.held_out_rms,
         f"{key}.held_out_worst": float(np.abs(fit.held_out).max()),
     }
@@ -124,5 +146,6 @@ def _comment(fit: GelFit, data: Path, diameter_mm: float, pads: Sequence[str], e
         f"The base with another gel: {TITLES[fit.name]} fitted to {data.name}, a ball of {diameter_mm:g} mm diameter,\n"
         f"pads {', '.join(pads)} together, by raytac calibrate, {datetime.date.today()}. Greatest error of force at a depth: "
         f"{100 * np.abs(fit.held_out).max():.1f} % with values\n"
-        f"fitted to the other depths, {100 * np.abs(errors).max():.1f} % as written. All else in [gelpad] is the base's."
+        f"fitted to the other depths, {100 * np.abs(errors).max():.1f} % as written. All else in [gelpad] is the base's, and so is the\n"
+        f"motion of markers, which `raytac calibrate markers` fits to this gel.{END if fit.at_end else ''}"
     )

@@ -11,7 +11,7 @@ from raytac.specs.height_map import HeightMap
 from raytac.specs.lens import Lens
 from raytac.specs.sensor import LedSpec, SensorSpec, Vec3, shading_degree
 from raytac.specs.toml import in_mm
-from raytac.specs.tone import LEAST_SLOPE
+from raytac.specs.tone import LEAST_SLOPE, MOST_COEFFICIENTS
 
 _COEFFICIENT = 5.0
 """Most that a coefficient of a colour shading may be, as in the file."""
@@ -216,6 +216,8 @@ def _check_vignetting(sensor: SensorSpec) -> None:
 
 
 def _check_tone(sensor: SensorSpec) -> None:
+    if len(sensor.response.tone) > MOST_COEFFICIENTS:
+        raise _error(sensor, "response.tone", list(sensor.response.tone), f"must have at most {MOST_COEFFICIENTS} coefficients")
     if (least := sensor.response.curve.least_slope) < LEAST_SLOPE:
         rule = f"the tone curve's least slope between black and white is {least:.3g}: must be at least {LEAST_SLOPE:g}"
         raise _error(sensor, "response.tone", list(sensor.response.tone), rule)

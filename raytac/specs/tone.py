@@ -20,6 +20,10 @@ from numpy.polynomial import Polynomial, legendre
 
 LEAST_SLOPE = 0.1
 """Least slope of a tone curve: one that falls gives two lights the same level."""
+MOST_COEFFICIENTS = 6
+"""Of a sensor file.
+
+Powers of u lose digits: in single precision curves of many more are wrong by whole levels."""
 _HALVINGS, _NEWTON = 8, 4
 """Steps of the inverse: halvings of an interval, then Newton's."""
 

@@ -14,6 +14,7 @@ from raytac.cli import main
 from raytac.errors import InputError
 from raytac.io.metrics import read_metrics
 from raytac.physics import Ipc, Rigid
+from raytac.report.gel_forces import check_apart
 from raytac.specs import SensorSpec, load_sensor
 
 RADIUS, DEPTHS = 7.5e-3, 1e-3 * np.array([0.5, 1.0, 1.5, 2.0])
@@ -126,3 +127,22 @@ def test_tables_and_options_that_say_nothing_are_refused(tmp_path: Path, capsys:
         assert main(["calibrate", str(data), *option, "--device", "cpu", "--out", str(out)]) == 2
         assert name in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_the_sensors_own_file_is_never_written_over(tmp_path: Path) -> None:
+    own = tmp_path / "gel" / "sensor.toml"
+    own.parent.mkdir()
+    own.write_text('base = "gelsight_mini"\n', "utf-8")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "mine.toml").write_text('base = "../gel/sensor.toml"\n', "utf-8")
+    for source in (own, tmp_path / "other" / "mine.toml"):
+        with pytest.raises(InputError, match=r"read from sensor\.toml in it"):
+            check_apart(source, own.parent)
+        check_apart(source, tmp_path / "fitted")
+    assert own.read_text("utf-8") == 'base = "gelsight_mini"\n'
+
+
+@pytest.mark.parametrize(("ratio", "at_end"), [(0.20, True), (0.42, False), (0.495, True)])
+def test_a_ratio_at_an_end_of_what_is_tried_is_marked(ratio: float, at_end: bool) -> None:
+    force = ball_forces(with_gel(MINI, 430e3, ratio), [Rigid()], RADIUS, DEPTHS)[0]
+    assert by_name(fit_gel(MINI, ForceTable(DEPTHS, force), RADIUS, [Rigid()]))["poisson_ratio"].at_end is at_end

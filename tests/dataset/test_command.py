@@ -54,7 +54,7 @@ def test_an_interrupted_run_says_what_it_leaves(tmp_path: Path, capsys: pytest.C
     small = ["--count", "3", "--shard-size", "2", "--outputs", "height"]
     with interrupted_at(1):
         assert main([*asked, *small]) == 130
-    assert "raytac: interrupted; finished shards are kept in" in capsys.readouterr().err
+    assert "raytac: interrupted; shards that are finished are kept in" in capsys.readouterr().err
     assert main([*asked, *small]) == 0
     assert "raytac: 1 of 2 shards are there and whole" in capsys.readouterr().err
 

@@ -86,6 +86,22 @@ def test_a_dot_darkens_light_and_not_levels(black: float) -> None:
         np.testing.assert_allclose(np.array(channel), levels(0.2 * light), atol=0.05)
 
 
+def test_a_dot_brighter_than_the_coat_stays_bright_under_a_tone_curve() -> None:
+    """Levels beyond white saturate; the curve, which is for levels up to white, does not turn them dark."""
+    mi, _ = load_mitsuba("cpu")
+    spec = like_a_mini()
+    spec = replace(
+        spec,
+        response=replace(CURVE, black_level=(0.0,) * 3),
+        coat=replace(spec.coat, reflectance=(0.5,) * 3, specular=0.0),
+        markers=replace(spec.markers, reflectance=0.9),
+    )
+    levels = np.array([120.0, 200.0, 240.0, 255.0])
+    for channel in darkened(spec, [mi.Float(levels)] * 3, mi.Float(1.0)):
+        shown = np.minimum(np.array(channel), 255)
+        assert (shown > levels - 0.01).all() and (np.diff(shown) >= 0).all()
+
+
 def background() -> np.ndarray:
     """A smooth, coloured image with a texture, as a camera might see an untouched gel."""
     v, u = np.indices(RESOLUTION[::-1]) / 60

@@ -15,11 +15,11 @@ from raytac.specs.tone import LEAST_SLOPE, STRAIGHT, ToneCurve
 U = np.linspace(0, 1, 501)
 
 
-def rising(count: int) -> list[ToneCurve]:
-    """Curves of up to five random coefficients that are steep enough everywhere."""
+def rising(count: int, most: int = 5) -> list[ToneCurve]:
+    """Curves of up to ``most`` random coefficients that are steep enough everywhere."""
     rng, curves = np.random.default_rng(0), []
     while len(curves) < count:
-        curve = ToneCurve(tuple(rng.uniform(-1, 1, rng.integers(1, 6))))
+        curve = ToneCurve(tuple(rng.uniform(-1, 1, rng.integers(1, most + 1))))
         if curve.least_slope >= LEAST_SLOPE:
             curves.append(curve)
     return curves
@@ -56,3 +56,11 @@ def test_a_curve_that_falls_is_refused_by_its_key() -> None:
         validate_sensor(replace(sensor, response=replace(sensor.response, tone=(1.0, 0.0, 1.0))))
     with pytest.raises(SpecError, match=r"tone"):
         replace(sensor.response, tone=(1.5,))
+    with pytest.raises(SpecError, match=r"response\.tone.*at most 6"):
+        validate_sensor(replace(sensor, response=replace(sensor.response, tone=(0.0,) * 6 + (0.01,))))
+
+
+def test_six_coefficients_keep_their_levels_in_single_precision() -> None:
+    for curve in rising(50, most=6):
+        off = curve.bent(U.astype(np.float32)) - curve.bent(U)
+        assert np.abs(255 * off).max() < 0.01, curve
