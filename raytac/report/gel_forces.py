@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import os
 import time
-import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +22,7 @@ from raytac.specs.files import available, find_file
 from raytac.specs.press import PADS
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.sensor_check import validate_sensor
-from raytac.specs.sensor_file import gelpad_files, load_sensor
+from raytac.specs.sensor_file import gelpad_files, load_sensor, sensor_files
 
 FORCE_PADS = ("rigid", *PADS)
 """Pads that forces can be fitted on: the rigid one, and levels of the soft one."""
@@ -79,14 +78,9 @@ def run_calibrate_forces(
 
 def check_apart(source: Path, out: Path) -> None:
     """InputError if ``out`` holds the sensor's file ``source``, or one that it is built on."""
-    folder, file = out.resolve(), source.resolve()
-    while True:
-        if file.parent == folder:
+    for file in sensor_files(source):
+        if file.resolve().parent == out.resolve():
             raise InputError("out", value=str(out), rule=f"must be another folder: the sensor is read from {file.name} in it")
-        base = tomllib.loads(file.read_text("utf-8")).get("base")
-        if base is None:
-            return
-        file = find_file("sensor", base, base=file.parent).resolve()
 
 
 def force_table(fits: Sequence[GelFit], best: GelFit, pads: Sequence[str], names: Sequence[str], errors: np.ndarray) -> str:

@@ -60,6 +60,14 @@ def sensor_spec(sensor: str | Path | SensorSpec) -> SensorSpec:
     return sensor
 
 
+def sensor_files(path: Path) -> list[Path]:
+    """A sensor file and those that it is built on, one after the other; it has been read before."""
+    top = read_toml(path)
+    if "base" not in top.data:
+        return [path]
+    return [path, *sensor_files(find_file("sensor", top.data["base"], base=path.parent))]
+
+
 def _read_sensor(path: Path, above: tuple[Path, ...] = ()) -> SensorSpec:
     """A sensor file, or ``base`` with this one's tables; ``above``: files built on this one."""
     top = read_toml(path)
