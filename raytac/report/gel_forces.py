@@ -22,7 +22,7 @@ from raytac.specs.files import available, find_file
 from raytac.specs.press import PADS
 from raytac.specs.sensor import SensorSpec
 from raytac.specs.sensor_check import validate_sensor
-from raytac.specs.sensor_file import gelpad_files, load_sensor, sensor_files
+from raytac.specs.sensor_file import files_in_chain, gelpad_files, load_sensor
 
 FORCE_PADS = ("rigid", *PADS)
 """Pads that forces can be fitted on: the rigid one, and levels of the soft one."""
@@ -78,7 +78,7 @@ def run_calibrate_forces(
 
 def check_apart(source: Path, out: Path) -> None:
     """InputError if ``out`` holds the sensor's file ``source``, or one that it is built on."""
-    for file in sensor_files(source):
+    for file in files_in_chain(source):
         if file.resolve().parent == out.resolve():
             raise InputError("out", value=str(out), rule=f"must be another folder: the sensor is read from {file.name} in it")
 

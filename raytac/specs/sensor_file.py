@@ -60,12 +60,12 @@ def sensor_spec(sensor: str | Path | SensorSpec) -> SensorSpec:
     return sensor
 
 
-def sensor_files(path: Path) -> list[Path]:
+def files_in_chain(path: Path) -> list[Path]:
     """A sensor file and those that it is built on, one after the other; it has been read before."""
     top = read_toml(path)
     if "base" not in top.data:
         return [path]
-    return [path, *sensor_files(find_file("sensor", top.data["base"], base=path.parent))]
+    return [path, *files_in_chain(find_file("sensor", top.data["base"], base=path.parent))]
 
 
 def _read_sensor(path: Path, above: tuple[Path, ...] = ()) -> SensorSpec:
