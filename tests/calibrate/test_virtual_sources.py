@@ -21,7 +21,7 @@ from raytac.specs.sensor_check import validate_sensor, view_edges
 from raytac.specs.sensor_file import lights_text, load_lights
 from tests.calibrate.test_light_fit import circles, direct
 
-SETTINGS = FitSettings(fixed=("gamma", "stray", "slope"), samples=(150, 100))
+SETTINGS = FitSettings(fixed=("gamma", "tone", "stray", "slope"), samples=(150, 100))
 
 
 @pytest.fixture(scope="module")

@@ -168,7 +168,7 @@ def test_interrupting_the_command_leaves_rows_but_no_report(
     greys = Greys(fail={"taxim": KeyboardInterrupt()})
     monkeypatch.setattr("raytac.report.compare.run.comparison_modes", lambda *_, **__: greys.modes)
     assert main([*QUICK, "--out", str(tmp_path / "out")]) == 130
-    assert "finished rows are kept" in capsys.readouterr().err
+    assert "rows that are finished are kept" in capsys.readouterr().err
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"rows", "references"}
 
 
