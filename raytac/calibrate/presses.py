@@ -226,7 +226,7 @@ def _from_files(folder: Path, files: list[Path], radii: list[float], circles: np
 def _image(path: Path, shape: tuple[int, ...] | None) -> np.ndarray:
     try:
         pixels = read_png(path)
-    except (OSError, ValueError, SyntaxError) as error:  # Pillow raises any of them on a damaged file
+    except OSError as error:
         reason = "is missing" if isinstance(error, FileNotFoundError) else f"cannot be read as an image ({error})"
         raise CalibrationError(reason, file=path) from error
     if shape is not None and pixels.shape != shape:

@@ -30,11 +30,14 @@ def write_png(path: str | Path, rgb_u8: np.ndarray) -> None:
 
 
 def read_png(path: str | Path) -> np.ndarray:
-    """The image as RGB, shape (H, W, 3), uint8."""
+    """The image as RGB, shape (H, W, 3), uint8. Raises ``OSError``: no such file, or no image."""
     from PIL import Image
 
-    with Image.open(path) as image:
-        return np.asarray(image.convert("RGB"))
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image.convert("RGB"))
+    except (ValueError, SyntaxError) as error:  # Pillow raises these too on a damaged file
+        raise OSError(str(error)) from error
 
 
 HEADER_PREFIX = "raytac:"

@@ -38,7 +38,7 @@ def draw_photograph(path: Path, resolution: tuple[int, int], seed: int) -> tuple
     file = files[np.random.default_rng((seed, 0)).integers(len(files))]
     try:
         photograph = read_png(file)
-    except (OSError, ValueError, SyntaxError) as error:  # Pillow raises any of them on a damaged file
+    except OSError as error:
         reason = "must exist" if isinstance(error, FileNotFoundError) else f"must be readable as an image ({error})"
         raise InputError("background", value=file, rule=reason) from error
     height, width = photograph.shape[:2]

@@ -57,7 +57,7 @@ class RowStore:
             if not whole or kept["image_sha256"] != _digest_image(image):
                 raise ValueError("contents differ from their checksum")
             return Row(kept["figures"], image)
-        except (OSError, ValueError, KeyError, TypeError, SyntaxError) as error:  # PIL calls a broken chunk a SyntaxError
+        except (OSError, ValueError, KeyError, TypeError) as error:
             self.say(f"{path.name} cannot be used ({error}): measured again")
             return None
 
