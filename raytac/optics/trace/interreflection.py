@@ -73,8 +73,8 @@ class CaseLight:
     def of(cls, mi: Any, sensor: SensorSpec, grid: PadGrid, lamps: list[Lamp], groups: list[int], seed: int) -> CaseLight:
         """The fit of a sensor at rest, with ``SAMPLES`` paths; made once for sensors of one kind.
 
-        It is kept in the user's cache. It does not depend on camera and response. So both sensors of a gripper share a fit, and no second Mitsuba scene is built, which
-        would leave memory behind. Tracing the paths takes about as long as all the rest of a press in a new process.
+        It does not depend on camera and response. So both sensors of a gripper share a fit, and no second Mitsuba scene is built, which
+        would leave memory behind. The user's cache keeps it: its paths take as long as half of all the rest of a press in a new process.
         """
         parts = sensor.gelpad, sensor.coat, sensor.case, sensor.refraction, sensor.lights.leds, sensor.markers.rows > 0
         nodes = tuple(values.tobytes() for values in (grid.x, grid.y, grid.rest))
