@@ -50,7 +50,7 @@ def random_poses(count: int, seed: int) -> np.ndarray:
 
 
 def test_bodies_beyond_a_face_are_those_of_numpy() -> None:
-    poses = random_poses(60, 1)
+    poses = random_poses(120, 1)
     expected = oracle_pierced.BondedFaces(GELS, bodies()).pierced(poses)
     np.testing.assert_array_equal(BondedFaces.on_cpu(GELS, bodies()).pierced(poses), expected)
     assert (expected.mean(axis=0) > 0.1).all() and (expected.mean(axis=0) < 0.9).all() and not expected[-1].any()
