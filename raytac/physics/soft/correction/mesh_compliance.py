@@ -32,8 +32,8 @@ def compliance_basis(mesh: PadMesh, gelpad: GelpadSpec) -> tuple[str | bytes, ..
 def correction_compliances(mesh: PadMesh, gelpad: GelpadSpec) -> tuple[np.ndarray, np.ndarray]:
     """Compliance of the coat, and of one whose sides may not move outwards.
 
-    Shapes (3, V, V), for forces along z, and (3, 3, V, V). Both take as long as a quarter of a press of the coarse pad: those of the last meshes are
-    kept and shared, read-only.
+    Shapes (3, V, V), for forces along z, and (3, 3, V, V). Both take as long as a quarter of a press of the coarse pad: those of the
+    last meshes are kept and shared, read-only.
     """
     key = hashlib.sha256(repr(compliance_basis(mesh, gelpad)).encode()).hexdigest()
     if key not in _kept:
