@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.arrays import FloatArray2d, IntArray, MatArray2d, SingleArray3d, VecArray2d
+from ipc.arrays import FloatArray2d, FloatArray3d, IntArray, MatArray2d, SingleArray3d, VecArray2d
 from ipc.contact.contacts import Contacts, mat34d, rows_of
 from ipc.solver.affine_elimination import Elimination, finish_elimination
 from ipc.solver.blocks import wait_for_block
@@ -36,9 +36,11 @@ from ipc.solver.preconditioners.contact_nodes import (
     rest_entry,
     slot_of,
 )
-from ipc.solver.preconditioners.dense import PANEL, invert
+from ipc.solver.preconditioners.dense import PANEL, invert, read_panel
 
 wp.set_module_options({"enable_backward": False})
+
+vec6d = wp.types.vector(length=PANEL, dtype=wp.float64)
 
 LANES = 256
 """Threads on CUDA for the small system of an environment; the size of all blocks."""
@@ -200,15 +202,33 @@ def sum_of_parts(y: SingleArray3d, place: wp.int32, u: wp.int32) -> wp.float32:
 
 
 @wp.func
-def stiffness_row(small: Small, env: wp.int32, i: wp.int32, x: FloatArray2d) -> wp.float64:
-    """(K x)_i; K is 1 for affine bodies."""
-    pads = 3 * small.pads[env]
-    if i >= pads:
-        return x[env, i]
-    total = wp.float64(0.0)
-    for j in range(pads):
-        total += small.k[env, j, i] * x[env, j]
+def column_sums(a: FloatArray3d, x: FloatArray2d, env: wp.int32, c: wp.int32, d: wp.int32, size: wp.int32) -> wp.vec2d:
+    """Σ_k a[k, j] x[k] of two columns j = c, d over ``size`` rows, whole panels.
+
+    A panel's numbers are read at once, since memory is what is waited for.
+    """
+    total = wp.vec2d()
+    for row in range(0, size, PANEL):
+        v, w = read_panel(a, env, row, c, d), vec6d()
+        for k in range(PANEL):
+            w[k] = x[env, row + k]
+        for k in range(PANEL):
+            for j in range(2):
+                total[j] = total[j] + v[k, j] * w[k]
     return total
+
+
+@wp.func
+def stiffness_rows(small: Small, env: wp.int32, c: wp.int32, d: wp.int32, x: FloatArray2d) -> wp.vec2d:
+    """Rows c < d, or c = d, of K x; K is 1 for affine bodies."""
+    pads = 3 * small.pads[env]
+    rows = wp.vec2d(x[env, c], x[env, d])
+    if c < pads:
+        total = column_sums(small.k, x, env, c, d, padded_size(small.pads[env]))
+        rows[0] = total[0]
+        if d < pads:
+            rows[1] = total[1]
+    return rows
 
 
 @wp.kernel
@@ -229,18 +249,29 @@ def contact_forces(
             small.t[env, i] = z[env, node][i % 3]
         else:
             small.t[env, i] = wp.float64(sum_of_parts(y, place[env], rest.unknown[node] + i % 3))
+    size = padded_size(small.count[env])
+    for i in range(n + lane, size, lanes):
+        small.t[env, i] = wp.float64(0.0)
+        small.force[env, i] = wp.float64(0.0)
     wait_for_block()
-    for i in range(lane, n, lanes):
-        small.force[env, i] = stiffness_row(small, env, i, small.t)
+    for c in range(lane, n, 2 * lanes):
+        d = wp.where(c + lanes < n, c + lanes, c)
+        rows = stiffness_rows(small, env, c, d, small.t)
+        small.force[env, c] = rows[0]
+        small.force[env, d] = rows[1]
     wait_for_block()
-    for i in range(lane, n, lanes):
-        total = wp.float64(0.0)
-        for j in range(n):
-            total += small.inverse[env, j, i] * small.force[env, j]
-        small.t[env, i] = total
+    for c in range(lane, n, 2 * lanes):
+        d = wp.where(c + lanes < n, c + lanes, c)
+        rows = column_sums(small.inverse, small.force, env, c, d, size)
+        small.t[env, c] = rows[0]
+        small.t[env, d] = rows[1]
     wait_for_block()
-    for i in range(lane, n, lanes):
-        small.force[env, i] = small.force[env, i] - stiffness_row(small, env, i, small.t)
+    for c in range(lane, n, 2 * lanes):
+        d = wp.where(c + lanes < n, c + lanes, c)
+        rows = stiffness_rows(small, env, c, d, small.t)
+        first, second = small.force[env, c] - rows[0], small.force[env, d] - rows[1]
+        small.force[env, c] = first
+        small.force[env, d] = second
 
 
 @wp.kernel
