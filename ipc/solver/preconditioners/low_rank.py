@@ -6,10 +6,9 @@ A = L Lᵀ is factored in each Newton iteration. By Woodbury's identity
 
     (K_0 + Jᵀ S J)⁻¹ = C − C Jᵀ W J C,      W = (S⁻¹ + J C Jᵀ)⁻¹ = K − K (K + S)⁻¹ K,      K = (J C Jᵀ)⁻¹.
 
-The second form needs no inverse of S, which is not regular where friction is missing. Affine bodies have unknowns Lᵀ x and rows L⁻¹ q here
-(``affine_factor.py``), for which K = 1. Inverses are computed in double precision by one block of threads an environment (``dense.py``).
-W itself is not: it is needed for few products in a Newton iteration, and three matrices times a vector have less arithmetic than a product
-of matrices.
+The second form needs no inverse of S, which is not regular where friction is missing. K stays while the contact nodes do, and is inverted;
+K + S changes in each Newton iteration, for few products, and is only factored. Both in double precision by one block of threads an
+environment (``dense.py``). Affine bodies have unknowns Lᵀ x and rows L⁻¹ q here (``affine_factor.py``), for which K = 1.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -36,11 +35,9 @@ from ipc.solver.preconditioners.contact_nodes import (
     rest_entry,
     slot_of,
 )
-from ipc.solver.preconditioners.dense import PANEL, invert, read_panel
+from ipc.solver.preconditioners.dense import PAIR, PANEL, factor, invert, read_panel, solve, vec6d
 
 wp.set_module_options({"enable_backward": False})
-
-vec6d = wp.types.vector(length=PANEL, dtype=wp.float64)
 
 LANES = 256
 """Threads on CUDA for the small system of an environment; the size of all blocks."""
@@ -131,13 +128,34 @@ def add_bodies(contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32
 
 @wp.func
 def padded_size(nodes: wp.int32) -> wp.int32:
-    """Unknowns of contact nodes, and up to the next multiple of ``PANEL``."""
-    return PANEL * ((3 * nodes + PANEL - 1) / PANEL)
+    """Unknowns of contact nodes, and up to the next multiple of ``PAIR``."""
+    return PAIR * ((3 * nodes + PAIR - 1) / PAIR)
 
 
 @wp.func
-def find_stiffness(rest: Rest, small: Small, env: wp.int32, lane: wp.int32, lanes: wp.int32) -> wp.bool:
-    """K = (J C Jᵀ)⁻¹ of the pads' contact nodes; False where a pivot is not positive."""
+def forget_rows(small: Small, env: wp.int32, lane: wp.int32, lanes: wp.int32):
+    """S = 0, for the next S."""
+    size = padded_size(small.count[env])
+    for e in range(lane, size * size, lanes):
+        small.s[env, e / size, e % size] = wp.float64(0.0)
+
+
+@wp.func
+def give_up(small: Small, env: wp.int32, lane: wp.int32, lanes: wp.int32):
+    """Do without contacts, which is still a preconditioner: something is not finite."""
+    forget_rows(small, env, lane, lanes)
+    wait_for_block()
+    if lane == 0:
+        small.count[env] = 0
+        small.known[env] = -1
+
+
+@wp.kernel(launch_bounds=(LANES, 1))
+def find_stiffness(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
+    """K = (J C Jᵀ)⁻¹ where the pads' contact nodes have changed, one block of threads an environment."""
+    env, lane = wp.tid()
+    if active[env] == 0 or not fits(small, env) or small.known[env] == small.pads[env]:
+        return
     n = 3 * small.pads[env]
     size = padded_size(small.pads[env])
     for e in range(lane, size * size, lanes):
@@ -152,45 +170,34 @@ def find_stiffness(rest: Rest, small: Small, env: wp.int32, lane: wp.int32, lane
             if rest.part[a] == rest.part[b]:
                 value = wp.float64(rest_entry(rest, rest.part[a], rest.unknown[a] + i % 3, rest.unknown[b] + j % 3))
         small.k[env, i, j] = value
-    return invert(small.k, small.inverse, env, size, lane, lanes)
+    if invert(small.k, small.factor, env, size, lane, lanes):
+        if lane == 0:
+            small.known[env] = small.pads[env]
+    else:
+        give_up(small, env, lane, lanes)
 
 
-@wp.kernel(launch_bounds=(LANES, 2))
-def invert_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
-    """(K + S)⁻¹, one block of threads an environment.
-
-    It leaves ``s`` zero for the next S.
-    """
+@wp.kernel(launch_bounds=(LANES, 1))
+def factor_contacts(active: IntArray, lanes: wp.int32, small: Small):
+    """K + S = Uᵀ U, one block of threads an environment."""
     env, lane = wp.tid()
     if active[env] == 0 or not fits(small, env):
         return
     size, pads = padded_size(small.count[env]), 3 * small.pads[env]
-    good = wp.bool(True)
-    if small.known[env] != small.pads[env]:
-        good = find_stiffness(rest, small, env, lane, lanes)
-    wait_for_block()
-    if good:
-        if lane == 0:
-            small.known[env] = small.pads[env]
-        for e in range(lane, size * size, lanes):
-            i = e / size
-            j = e - size * i
-            if i <= j:
-                value = small.s[env, i, j]
-                if j < pads:
-                    value += small.k[env, i, j]
-                elif i == j:
-                    value += wp.float64(1.0)
-                small.inverse[env, i, j] = value
-        good = invert(small.inverse, small.s, env, size, lane, lanes)
-    if not good:
-        # Something is not finite: without contacts it is still a preconditioner.
-        wait_for_block()
-        if lane == 0:
-            small.count[env] = 0
-            small.known[env] = -1
     for e in range(lane, size * size, lanes):
-        small.s[env, e / size, e % size] = wp.float64(0.0)
+        i = e / size
+        j = e - size * i
+        if i <= j:
+            value = small.s[env, i, j]
+            if j < pads:
+                value += small.k[env, i, j]
+            elif i == j:
+                value += wp.float64(1.0)
+            small.factor[env, i, j] = value
+    if factor(small.factor, env, size, lane, lanes):
+        forget_rows(small, env, lane, lanes)
+    else:
+        give_up(small, env, lane, lanes)
 
 
 @wp.func
@@ -260,12 +267,10 @@ def contact_forces(
         small.force[env, c] = rows[0]
         small.force[env, d] = rows[1]
     wait_for_block()
-    for c in range(lane, n, 2 * lanes):
-        d = wp.where(c + lanes < n, c + lanes, c)
-        rows = column_sums(small.inverse, small.force, env, c, d, size)
-        small.t[env, c] = rows[0]
-        small.t[env, d] = rows[1]
+    for i in range(lane, size, lanes):
+        small.t[env, i] = small.force[env, i]
     wait_for_block()
+    solve(small.factor, small.t, small.half, env, size, lane, lanes)
     for c in range(lane, n, 2 * lanes):
         d = wp.where(c + lanes < n, c + lanes, c)
         rows = stiffness_rows(small, env, c, d, small.t)
@@ -284,9 +289,9 @@ def eliminate_where_full(
         finish_elimination(e, inverse, env, lane, threads, r, z)
 
 
-def even(room: int) -> int:
-    """Contact nodes whose unknowns fill whole panels."""
-    return room + room % 2
+def whole_pairs(room: int) -> int:
+    """Contact nodes, at least ``room``, whose unknowns fill whole pairs of panels."""
+    return room + -room % (PAIR // 3)
 
 
 class LowRank:
@@ -301,7 +306,7 @@ class LowRank:
         self.rest, self.batch, self.row_lanes, self.device = rest, batch, row_lanes, device
         self.lanes = LANES if device.is_cuda else 1
         nodes = max(1, len(rest.surface_node))
-        room = even(max(1, min(room, nodes)))
+        room = whole_pairs(max(1, min(room, nodes)))
 
         def zeros(*shape: int, dtype: type = wp.float32) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device)
@@ -311,8 +316,8 @@ class LowRank:
         small.count, small.pads = zeros(batch, dtype=wp.int32), zeros(batch, dtype=wp.int32)
         small.node = zeros(batch, room, dtype=wp.int32)
         small.known = wp.full(batch, -1, dtype=wp.int32, device=device)
-        small.s, small.k, small.inverse = (zeros(batch, 3 * room, 3 * room, dtype=wp.float64) for _ in range(3))
-        small.t, small.force = zeros(batch, 3 * room, dtype=wp.float64), zeros(batch, 3 * room, dtype=wp.float64)
+        small.s, small.k, small.factor = (zeros(batch, 3 * room, 3 * room, dtype=wp.float64) for _ in range(3))
+        small.t, small.half, small.force = (zeros(batch, 3 * room, dtype=wp.float64) for _ in range(3))
         self.bodies = len(rest.affine_node) // 4
         small.root = zeros(batch, 4 * self.bodies, 4, dtype=wp.mat33d)
         self.small, self.full = small, zeros(batch, dtype=wp.int32)
@@ -341,7 +346,8 @@ class LowRank:
             if self.bodies:
                 inputs = [contacts, rest, active, self.lanes, small]
                 self._launch(add_bodies, (self.batch, self.bodies, self.lanes), inputs, self.lanes)
-            self._launch(invert_small, (self.batch, self.lanes), [rest, active, self.lanes, small], self.lanes)
+            self._launch(find_stiffness, (self.batch, self.lanes), [rest, active, self.lanes, small], self.lanes)
+            self._launch(factor_contacts, (self.batch, self.lanes), [active, self.lanes, small], self.lanes)
 
     def find_forces(self, y: wp.array, z: wp.array, running: wp.array, place: wp.array) -> None:
         """Compute ``small.force`` = W t for the running environments.
