@@ -72,7 +72,9 @@ class Potential:
         self.dt = wp.full(batch, settings.dt, dtype=wp.float64, device=device)
         drag = np.zeros(len(layout.col))
         drag[diagonal] = layout.node_damping
-        pattern = {"row_start": layout.row_start, "col": layout.col, "mass": layout.mass}
+        massive = np.flatnonzero(layout.mass)
+        starts = np.concatenate([[0], np.cumsum(np.bincount(rows[massive], minlength=nodes))])
+        pattern = {"row_start": starts, "block": massive, "col": layout.col, "mass": layout.mass}
         inertia = layout.mass * (1.0 + layout.node_drive[rows])
         self.masses = filled(dynamics.Masses, device, {**pattern, "inertia": inertia, "drag": drag})
         self.drive = [floats(layout.node_drive), ints(layout.node_aim), wp.array(layout.aim_local, dtype=wp.vec3d, device=device)]
