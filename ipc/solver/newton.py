@@ -219,6 +219,7 @@ class Newton:
         pot.aim()
         pot.aim_inertia(pot.R, pot.t)
         pot.measure_reach()
+        pot.forget_matrix()
 
     def _set_flags(self) -> None:
         self.state.clear_flags()
