@@ -1,4 +1,4 @@
-"""Conjugate gradients of an environment by one thread, for the worlds of :mod:`ipc.solver.halves`."""
+"""Conjugate gradients of an environment by one thread (:mod:`ipc.solver.halves`)."""
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
 # pyright: reportInvalidTypeForm=false
