@@ -21,6 +21,7 @@ from ipc.solver.block_jacobi import BlockJacobi
 from ipc.solver.blocks import THREADS
 from ipc.solver.linear import Preconditioner, SystemView, find_volume_motions, multiply_blocks, multiply_rows
 from ipc.solver.pcg_block import Scalars, solve_in_one_block
+from ipc.solver.pcg_serial import solve_serially
 
 wp.set_module_options({"enable_backward": False})
 
@@ -176,7 +177,13 @@ class Pcg:
             max_iterations: after these the solution so far stands (it is a descent direction).
             active: mask (B,).
         """
-        if self.is_in_one_block(preconditioner):
+        if self.is_in_one_block(preconditioner) and preconditioner.lines is not None:
+            inputs = [
+                *(system, contacts, preconditioner.inverse, preconditioner.lines, preconditioner.elimination),
+                *(tolerance, max_iterations, active, self._p, self._Ap),
+            ]
+            wp.launch(solve_serially, dim=self.batch, inputs=inputs, outputs=[residual, x, self.scalars], device=self.device)
+        elif self.is_in_one_block(preconditioner):
             threads = THREADS if self.device.is_cuda else 1
             inputs = [
                 *(system, contacts, preconditioner.inverse, preconditioner.elimination, tolerance, max_iterations),

@@ -18,7 +18,7 @@ from ipc.bodies.layout import Layout
 from ipc.contact.collision import Collision
 from ipc.reduce import BLOCK, MAX, MIN, SUM, Reducer
 from ipc.settings import Settings
-from ipc.solver import dilation, dynamics, elasticity, frames
+from ipc.solver import dilation, dynamics, elasticity, frames, reuse
 from ipc.solver.halves import fold_rows
 from ipc.solver.linear import SystemView, find_volume_motions, push_blocks, push_rows, slice_rows, turn_rows
 
@@ -72,7 +72,9 @@ class Potential:
         self.dt = wp.full(batch, settings.dt, dtype=wp.float64, device=device)
         drag = np.zeros(len(layout.col))
         drag[diagonal] = layout.node_damping
-        pattern = {"row_start": layout.row_start, "col": layout.col, "mass": layout.mass}
+        massive = np.flatnonzero(layout.mass)
+        starts = np.concatenate([[0], np.cumsum(np.bincount(rows[massive], minlength=nodes))])
+        pattern = {"row_start": starts, "block": massive, "col": layout.col, "mass": layout.mass}
         inertia = layout.mass * (1.0 + layout.node_drive[rows])
         self.masses = filled(dynamics.Masses, device, {**pattern, "inertia": inertia, "drag": drag})
         self.drive = [floats(layout.node_drive), ints(layout.node_aim), wp.array(layout.aim_local, dtype=wp.vec3d, device=device)]
@@ -138,6 +140,8 @@ class Potential:
         self.system.R = self.R
         self.system.project = self.project
         self.mirrors = True
+        self._kept: Any = None
+        """Blocks without contact rows (:mod:`ipc.solver.reuse`)."""
 
     def launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list | None = None) -> None:
         """Launch a kernel on the device of the batch."""
@@ -251,15 +255,29 @@ class Potential:
                 *(self.el_F, self.el_mckl, active),
             ]
             self.launch(elasticity.block_hessian, dim, inputs, [blocks])
+        elif self._kept is not None:
+            inputs = [self.el_F, self.project, active]
+            self.launch(reuse.choose_stale, self.batch, inputs, [self._kept_F, self._filled, self._stale])
+            self._fill_elements(self._stale, self._kept)
+            self.launch(reuse.copy_blocks, dim, [self.upper, self.mirrors, self._kept, active], [blocks])
         else:
-            self.launch(elasticity.fill_inertia, dim, [self.upper, self.masses, self.dt, active], [blocks])
-            inputs = [self.places, self.elements, self.el_F, self.el_mckl, active]
-            self.launch(elasticity.add_element_blocks, self.el_J.shape, inputs, [blocks])
-            if self.mirrors:
-                self.launch(elasticity.mirror_blocks, dim, [self.upper, active], [blocks])
+            self._fill_elements(active, blocks)
         if self.volume_blocks:
             inputs, row = [self.elements, self.volumes, self.el_F, active], self.system.volume_row
             self.launch(dilation.dilation_rows, row.shape, inputs, [row])
+
+    def _fill_elements(self, active: wp.array, blocks: wp.array) -> None:
+        dim = self.batch, len(self.upper)
+        self.launch(elasticity.fill_inertia, dim, [self.upper, self.masses, self.dt, active], [blocks])
+        inputs = [self.places, self.elements, self.el_F, self.el_mckl, active]
+        self.launch(elasticity.add_element_blocks, self.el_J.shape, inputs, [blocks])
+        if self.mirrors:
+            self.launch(elasticity.mirror_blocks, dim, [self.upper, active], [blocks])
+
+    def forget_matrix(self) -> None:
+        """Let the next :meth:`fill_matrix` compute all blocks."""
+        if self._kept is not None:
+            self._filled.fill_(reuse.NONE)
 
     def turn_rows(self, active: wp.array) -> None:
         """Write the contact rows of :meth:`touch` over the unknowns."""
@@ -286,6 +304,8 @@ class Potential:
             self.upper = wp.array(upper[unknown[upper[:, 0]]], dtype=wp.int32, device=self.device)
             places = _element_places(layout, rows, where, unknown)
             self.places = wp.array(places, dtype=wp.int32, device=self.device)
+            self._kept, self._kept_F = wp.zeros_like(self.system.blocks), wp.zeros_like(self.el_F)
+            self._filled, self._stale = (wp.full(self.batch, reuse.NONE, dtype=wp.int32, device=self.device) for _ in range(2))
 
     def fold_rows(self, active: wp.array) -> None:
         """Add the rows of :meth:`turn_rows` to the blocks, if halves are used."""
