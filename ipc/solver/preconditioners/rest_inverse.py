@@ -100,7 +100,8 @@ def multiply_tiles(
 
     Each part c of the inputs is summed apart.
     """
-    part, patch, i, j = wp.tid()
+    both, i, j = wp.tid()
+    part, patch = both / matrix.shape[0], both % matrix.shape[0]
     if i * TILE_ENVS >= total_running[0]:
         return
     inputs, outputs = matrix.shape[1], matrix.shape[2]
@@ -141,7 +142,7 @@ class Product:
                 y = self.y_whole.numpy()[:, self.y_first + p * outputs :][:, :outputs]
                 np.matmul(x, self.matrix.numpy()[p], out=y)
         elif tiled(self.batch, device):
-            dim = (self.y.shape[0], patches, self.x.shape[0] // TILE_ENVS, outputs // TILE_OUT)
+            dim = (self.y.shape[0] * patches, self.x.shape[0] // TILE_ENVS, outputs // TILE_OUT)
             inputs = [*common, self.total_running]
             wp.launch_tiled(multiply_tiles, dim=dim, inputs=inputs, outputs=[self.y], block_dim=LANES, device=device)
         else:
