@@ -411,20 +411,6 @@ def fold(values: wp.array2d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32)
 
 
 @wp.kernel
-def scale(
-    active: wp.array(dtype=wp.int32), factor: wp.array3d(dtype=wp.float32), field: wp.array3d(dtype=wp.float32),
-    # outputs
-    out: wp.array3d(dtype=wp.float32),
-):  # fmt: skip
-    """Field times a factor for all environments, by (environment, row)."""
-    env, row = wp.tid()
-    if active[env] == 0:
-        return
-    for i in range(field.shape[2]):
-        out[env, row, i] = field[env, row, i] * factor[0, row, i]
-
-
-@wp.kernel
 def convolve(
     active: wp.array(dtype=wp.int32), columns: wp.array(dtype=wp.vec2i), table: wp.array2d(dtype=Any),
     half: wp.array3d(dtype=Any), nodes: wp.int32, threads: wp.int32,

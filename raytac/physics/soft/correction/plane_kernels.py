@@ -96,3 +96,51 @@ def sampled(field: wp.array3d(dtype=wp.float32), env: wp.int32, lines: Lines, pl
     near = (_1 - a) * wp.float64(field[env, j, i]) + a * wp.float64(field[env, j, i + 1])
     far = (_1 - a) * wp.float64(field[env, j + 1, i]) + a * wp.float64(field[env, j + 1, i + 1])
     return (_1 - b) * near + b * far
+
+
+@wp.kernel
+def sort_waves(
+    active: wp.array(dtype=wp.int32), factor: wp.array3d(dtype=wp.float32), waves: wp.array3d(dtype=wp.float32),
+    # outputs
+    out: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
+    """Amplitudes times a factor, even waves before odd ones along both axes.
+
+    By (environment, row).
+    """
+    env, row = wp.tid()
+    if active[env] == 0:
+        return
+    rows, count = (waves.shape[1] + 1) / 2, (waves.shape[2] + 1) / 2
+    k = 2 * row
+    if row >= rows:
+        k = 2 * (row - rows) + 1
+    for i in range(count):
+        out[env, row, i] = waves[env, k, 2 * i] * factor[0, k, 2 * i]
+    for i in range(waves.shape[2] - count):
+        out[env, row, count + i] = waves[env, k, 2 * i + 1] * factor[0, k, 2 * i + 1]
+
+
+@wp.kernel
+def unfold(
+    active: wp.array(dtype=wp.int32), even: wp.array3d(dtype=wp.float32), odd_x: wp.array3d(dtype=wp.float32),
+    odd_y: wp.array3d(dtype=wp.float32), odd: wp.array3d(dtype=wp.float32),
+    # outputs
+    out: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
+    """Field at all nodes, from the sums of even and odd waves at those of a quarter.
+
+    By (environment, row of the quarter).
+    """
+    env, j = wp.tid()
+    if active[env] == 0:
+        return
+    last_y, last_x = out.shape[1] - 1, out.shape[2] - 1
+    for i in range(even.shape[2]):
+        near, far = even[env, j, i] + odd_x[env, j, i], odd_y[env, j, i] + odd[env, j, i]
+        out[env, j, i] = near + far
+        out[env, last_y - j, i] = near - far
+    for i in range(even.shape[2]):
+        near, far = even[env, j, i] - odd_x[env, j, i], odd_y[env, j, i] - odd[env, j, i]
+        out[env, j, last_x - i] = near + far
+        out[env, last_y - j, last_x - i] = near - far
