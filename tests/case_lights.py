@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.abc
 import importlib.machinery
-import runpy
 import sys
 from types import ModuleType
 from typing import Any
@@ -33,7 +32,7 @@ def limit(*, few: bool) -> None:
     module.SAMPLES = FEW if few else _full[0]
 
 
-class _FewPaths(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+class FewPaths(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     """Sets the number of paths when the module is imported, so that a script that renders nothing imports no renderer."""
 
     def find_spec(self, fullname: str, path: Any, target: ModuleType | None = None) -> importlib.machinery.ModuleSpec | None:
@@ -48,9 +47,3 @@ class _FewPaths(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     def exec_module(self, module: ModuleType) -> None:
         self._loader.exec_module(module)
         module.__dict__["SAMPLES"] = FEW
-
-
-if __name__ == "__main__":  # python -m tests.case_lights SCRIPT: the script runs as by itself, its fits with ``FEW`` paths
-    sys.meta_path.insert(0, _FewPaths())
-    sys.argv = sys.argv[1:]
-    runpy.run_path(sys.argv[0], run_name="__main__")

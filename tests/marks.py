@@ -124,6 +124,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "examples",
         "experiments",
         "learn",
+        "test_forked.py",
         "test_packaging.py",
         "view/test_browser.py",
         "view/test_guard.py",

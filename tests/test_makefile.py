@@ -75,6 +75,26 @@ def test_a_check_asks_for_the_types_of_what_changed_only(checkout: Path) -> None
     changed.touch()
     (line,) = [line for line in planned(checkout, "check").splitlines() if "pyright" in line]
     assert line.split()[1:] == ["raytac/changed.py"]
+
+
+@needs_make
+@pytest.mark.parametrize("change", ["raytac/kept.py", "raytac/kept.pyi", "pyproject.toml", ".venv/.installed-test", None])
+def test_the_whole_suite_asks_for_all_types_unless_nothing_has_changed(checkout: Path, change: str | None) -> None:
+    (checkout / "raytac" / "__pycache__").mkdir(parents=True)
+    for name in ("kept.py", "kept.pyi", "removed.py"):
+        (checkout / "raytac" / name).touch()
+    past = time.time() - 10
+    for path in (*checkout.rglob("*"), checkout / "raytac"):
+        os.utime(path, (past, past))
+    (checkout / ".venv" / ".types-all").touch()
+    (checkout / "raytac" / "__pycache__" / "kept.pyc").touch()
+    assert "pyright" not in planned(checkout, "test")
+    later = time.time() + 10
+    if change is None:
+        (checkout / "raytac" / "removed.py").unlink()
+        os.utime(checkout / "raytac", (later, later))
+    else:
+        os.utime(checkout / change, (later, later))
     (line,) = [line for line in planned(checkout, "test").splitlines() if "pyright" in line]
     assert line.split()[1:] == []
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
-import subprocess
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 from raytac.device import cuda_missing
+from tests.forked import run_forked
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -42,9 +40,7 @@ def run(code: str, folder: Path) -> None:
     """Run a program in ``folder``, with this checkout's packages, on the CPU; pages name files as a checkout has them."""
     (folder / "examples").symlink_to(ROOT / "examples")
     (folder / "page.py").write_text(code, encoding="utf-8")
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path]), "MPLBACKEND": "Agg"}
-    command = [sys.executable, "-m", "tests.case_lights", "page.py"]
-    result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    result = run_forked("page.py", cwd=folder, env={"MPLBACKEND": "Agg"})
     assert result.returncode == 0, result.stderr[-3000:]
 
 

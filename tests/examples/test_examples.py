@@ -1,13 +1,12 @@
-"""Examples are short, and each runs as a visitor would run it."""
+"""Examples are short, and each runs in a process of its own."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+from tests.forked import run_forked
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -46,8 +45,6 @@ def test_an_example_fits_on_a_screen_and_says_how_to_run_it(path: Path) -> None:
 def test_an_example_runs(name: str, tmp_path: Path) -> None:
     if name in ("foreign_env", "foreign_robosuite", "gym_env", "own_vector_env", "record_lerobot"):
         pytest.importorskip("gymnasium")
-    command = [sys.executable, "-m", "tests.case_lights", str(ROOT / "examples" / f"{name}.py")]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
+    done = run_forked(str(ROOT / "examples" / f"{name}.py"), cwd=tmp_path, env={"CUDA_VISIBLE_DEVICES": ""})
     assert done.returncode == 0, done.stderr
     assert SAYS[name] in done.stdout

@@ -15,14 +15,20 @@ the shape of the specular lobe (indirect light meets the albedo (1 − s) ρ + s
 
 from __future__ import annotations
 
+import hashlib
+import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
 from raytac.gel.surface import PadGrid
+from raytac.io.arrays import npy_bytes
+from raytac.io.cache import cache_folder, keep_cached, read_cached
+from raytac.io.code_digest import code_digest
 from raytac.optics.camera import Pinhole
 from raytac.optics.geometry import CoatField, CoatLayout, NodeGrid, PixelSample, bilinear, nodes_in_view
 from raytac.optics.trace.led import Lamp
@@ -50,6 +56,12 @@ def _monomials(u: Any, v: Any) -> list[Any]:
     return [u**i * v**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
 
 
+def _cache_file(basis: tuple[Any, ...]) -> Path | None:
+    """File of the fit that depends on ``basis``; None for a user without a home folder."""
+    folder = cache_folder("case_light")
+    return None if folder is None else folder / f"{hashlib.sha256(repr(basis).encode()).hexdigest()[:24]}.npy"
+
+
 @dataclass(frozen=True)
 class CaseLight:
     """Irradiance from the case: ``coefficients`` (3·G, terms, 4) of x, y and (1, n_x, n_y, n_z)."""
@@ -62,13 +74,19 @@ class CaseLight:
         """The fit of a sensor at rest, with ``SAMPLES`` paths; made once for sensors of one kind.
 
         It does not depend on camera and response. So both sensors of a gripper share a fit, and no second Mitsuba scene is built, which
-        would leave memory behind.
+        would leave memory behind. The user's cache keeps it: its paths take as long as half of all the rest of a press in a new process.
         """
         parts = sensor.gelpad, sensor.coat, sensor.case, sensor.refraction, sensor.lights.leds, sensor.markers.rows > 0
         nodes = tuple(values.tobytes() for values in (grid.x, grid.y, grid.rest))
         key = parts, nodes, tuple(groups), seed, SAMPLES, mi.variant()
         if key not in _fits:
-            light = cls.fit(SensorScene(mi, sensor, grid), lamps, groups, seed, SAMPLES)
+            path = _cache_file((*key, mi.__version__, code_digest(__name__)))
+            kept = read_cached(path)
+            if kept is None:
+                light = cls.fit(SensorScene(mi, sensor, grid), lamps, groups, seed, SAMPLES)
+                keep_cached(path, npy_bytes(light.coefficients))
+            else:
+                light = cls(np.load(io.BytesIO(kept), allow_pickle=False), (float(grid.x[-1]), float(grid.y[-1])))
             while len(_fits) >= _MOST_FITS:
                 del _fits[next(iter(_fits))]
             _fits[key] = light

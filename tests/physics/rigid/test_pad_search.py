@@ -120,14 +120,15 @@ def same(one: PadContacts, other: PadContacts) -> None:
         np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name), err_msg=field.name)
 
 
+@pytest.mark.parametrize("count", [4 * len(KINDS), pytest.param(250, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("gelpad", [DOME, FLAT], ids=["dome", "flat"])
-def test_contacts_are_those_of_the_reference(gelpad: GelpadSpec) -> None:
-    """250 random bodies on each gelpad: depth 1 µm, centroid 5 µm, force 0.5 %.
+def test_contacts_are_those_of_the_reference(gelpad: GelpadSpec, count: int) -> None:
+    """Random bodies of every kind on each gelpad: depth 1 µm, centroid 5 µm, force 0.5 %.
 
     That is between the same levels of the gap. Of few nodes, more levels find a region of more force, and the stiffness of more of
     them is computed: by two nodes' share and 1 % at most.
     """
-    bodies, poses = pressed(gelpad, 250, seed=7)
+    bodies, poses = pressed(gelpad, count, seed=7)
     contacts = PadSearch([gelpad], bodies, num_envs=1).contacts(poses[None, None], np.array([0]), REACH)
     np.testing.assert_array_equal(contacts.body, np.arange(len(bodies)))
     grid, missed = make_grid(gelpad, 0.2e-3), 0
@@ -162,7 +163,7 @@ def test_contacts_are_those_of_the_reference(gelpad: GelpadSpec) -> None:
         for radius, d in zip(contacts.radius[k, at], depths[at], strict=True):
             wide = law.contact_radius(d) > gelpad.thickness
             assert radius == pytest.approx(law.contact_radius(d), rel=(5e-2 if wide else 2e-2) + 3.0 / nodes), name
-    assert missed <= 3
+    assert missed <= max(1, 3 * count // 250)
 
 
 @pytest.fixture(scope="module")

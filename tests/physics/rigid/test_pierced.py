@@ -58,7 +58,7 @@ def test_bodies_beyond_a_face_are_those_of_numpy() -> None:
 
 def test_paths_through_a_face_are_those_of_numpy() -> None:
     """From above the gel to below the case, with a turn; before may be unknown."""
-    after, before = random_poses(30, 2), random_poses(30, 3)
+    after, before = random_poses(12, 2), random_poses(12, 3)
     after[..., 2, 3] -= 0.03
     before[..., 2, 3] += 0.03
     before[::5] = np.nan

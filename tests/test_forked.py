@@ -1,0 +1,46 @@
+"""A forked script has what a process of its own has: arguments, folder, environment, output and exit code."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.forked import run_forked
+
+TELLS = """
+import os, sys, threading
+from helper import GREETING
+print(__name__, sys.argv[1:], os.getcwd(), GREETING, os.environ.get("ASKED"), "UNASKED" in os.environ, "raytac.sensor" in sys.modules)
+print(os.getpid(), sys.stdin.read(), file=sys.stderr)
+threading.Timer(0.05, print, ["from a thread"]).start()
+sys.exit(int(sys.argv[1]))
+"""
+
+
+def test_a_script_is_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "scripts").mkdir()
+    (tmp_path / "scripts" / "tells.py").write_text(TELLS)
+    (tmp_path / "scripts" / "helper.py").write_text("GREETING = 'hello'")
+    script, processes = str(tmp_path / "scripts" / "tells.py"), set()
+    for code in (0, 3):
+        monkeypatch.setenv("UNASKED", "1") if code else monkeypatch.delenv("UNASKED", raising=False)
+        done = run_forked(script, str(code), cwd=tmp_path, env={"ASKED": "yes"})
+        assert done.returncode == code
+        assert done.stdout == f"__main__ ['{code}'] {tmp_path} hello yes {code == 3} True\nfrom a thread\n"
+        processes.add(int(done.stderr))
+    assert len(processes | {os.getpid()}) == 3
+
+
+def test_an_error_is_told_and_nothing_of_a_script_stays(tmp_path: Path) -> None:
+    (tmp_path / "breaks.py").write_text("import math; math.pi = 3; raise ValueError('nobody')")
+    (tmp_path / "reads.py").write_text("import math; print(math.pi)")
+    broken = run_forked("breaks.py", cwd=tmp_path)
+    assert broken.returncode == 1 and "breaks.py" in broken.stderr and broken.stderr.endswith("ValueError: nobody\n")
+    assert run_forked("reads.py", cwd=tmp_path).stdout.startswith("3.14")
+
+
+def test_a_module_runs_as_a_program(tmp_path: Path) -> None:
+    done = run_forked("-m", "raytac", "press", "coin", "--optics", "phng", cwd=tmp_path)
+    assert done.returncode == 2 and "did you mean 'phong'" in done.stderr and not done.stdout
