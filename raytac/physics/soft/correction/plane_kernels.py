@@ -115,10 +115,11 @@ def sort_waves(
     k = 2 * row
     if row >= rows:
         k = 2 * (row - rows) + 1
+    into, source, share = out[env, row], waves[env, k], factor[0, k]
     for i in range(count):
-        out[env, row, i] = waves[env, k, 2 * i] * factor[0, k, 2 * i]
+        into[i] = source[2 * i] * share[2 * i]
     for i in range(waves.shape[2] - count):
-        out[env, row, count + i] = waves[env, k, 2 * i + 1] * factor[0, k, 2 * i + 1]
+        into[count + i] = source[2 * i + 1] * share[2 * i + 1]
 
 
 @wp.kernel
@@ -135,12 +136,14 @@ def unfold(
     env, j = wp.tid()
     if active[env] == 0:
         return
-    last_y, last_x = out.shape[1] - 1, out.shape[2] - 1
-    for i in range(even.shape[2]):
-        near, far = even[env, j, i] + odd_x[env, j, i], odd_y[env, j, i] + odd[env, j, i]
-        out[env, j, i] = near + far
-        out[env, last_y - j, i] = near - far
-    for i in range(even.shape[2]):
-        near, far = even[env, j, i] - odd_x[env, j, i], odd_y[env, j, i] - odd[env, j, i]
-        out[env, j, last_x - i] = near + far
-        out[env, last_y - j, last_x - i] = near - far
+    count, last = even.shape[2], out.shape[2] - 1
+    upper, lower = out[env, j], out[env, out.shape[1] - 1 - j]
+    a, b, c, d = even[env, j], odd_x[env, j], odd_y[env, j], odd[env, j]
+    for i in range(count):
+        near, far = a[i] + b[i], c[i] + d[i]
+        upper[i] = near + far
+        lower[i] = near - far
+    for i in range(count):
+        near, far = a[i] - b[i], c[i] - d[i]
+        upper[last - i] = near + far
+        lower[last - i] = near - far
