@@ -15,10 +15,10 @@ from typing import Any, TypeGuard
 import warp as wp
 
 from ipc.arrays import FloatArray2d, IntArray, VecArray2d
+from ipc.blocks import THREADS
 from ipc.contact.contacts import Contacts
 from ipc.reduce import BLOCK, chunks_of, raise_if_any, total_of
 from ipc.solver.block_jacobi import BlockJacobi
-from ipc.solver.blocks import THREADS
 from ipc.solver.linear import Preconditioner, SystemView, find_volume_motions, multiply_blocks, multiply_rows
 from ipc.solver.pcg_block import Scalars, solve_in_one_block
 from ipc.solver.pcg_serial import solve_serially

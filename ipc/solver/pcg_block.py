@@ -13,9 +13,9 @@ from __future__ import annotations
 import warp as wp
 
 from ipc.arrays import FloatArray, FloatArray2d, IntArray, MatArray2d, VecArray2d
+from ipc.blocks import block_sum, wait_for_block
 from ipc.contact.contacts import Contacts, rows_of
 from ipc.solver.affine_elimination import Elimination, finish_elimination
-from ipc.solver.blocks import block_sum, wait_for_block
 from ipc.solver.linear import SystemView, add_row, block_row, find_volume_motion
 
 wp.set_module_options({"enable_backward": False})

@@ -16,7 +16,7 @@ from __future__ import annotations
 import warp as wp
 
 from ipc.arrays import FloatArray2d, FloatArray3d
-from ipc.solver.blocks import wait_for_block
+from ipc.blocks import wait_for_block
 
 wp.set_module_options({"enable_backward": False})
 

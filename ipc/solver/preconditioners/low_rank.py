@@ -19,9 +19,9 @@ from __future__ import annotations
 import warp as wp
 
 from ipc.arrays import FloatArray2d, FloatArray3d, IntArray, MatArray2d, SingleArray3d, VecArray2d
+from ipc.blocks import wait_for_block
 from ipc.contact.contacts import Contacts, mat34d, rows_of
 from ipc.solver.affine_elimination import Elimination, finish_elimination
-from ipc.solver.blocks import wait_for_block
 from ipc.solver.linear import SystemView, row_column
 from ipc.solver.preconditioners.affine_factor import factor_affine, scaled_row
 from ipc.solver.preconditioners.contact_nodes import (
@@ -43,6 +43,8 @@ LANES = 256
 """Threads on CUDA for the small system of an environment; the size of all blocks."""
 _APART = 64
 """Threads a body, of which one works: few then share a cache, since registers do not do."""
+_BODY_THREADS = 1024
+"""Threads on CUDA that add up the rows of a body."""
 _ENTRIES = 78
 """Of the upper half of a body's 12 × 12 matrix."""
 
@@ -97,8 +99,8 @@ def add_rows(contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32, 
 
 
 @wp.kernel
-def add_bodies(contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
-    """S += the upper half of Σ g gᵀ of each affine body's rows, one block of threads a body.
+def add_bodies(contacts: Contacts, rows_g: FloatArray3d, rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
+    """S += the upper half of Σ g gᵀ of each affine body's rows; ``rows_g`` (B, rows, 12) are the numbers of their g.
 
     Nearly all rows belong to a body: its twelve unknowns are added up by entries of S, and not by rows, which would all meet there.
     """
@@ -118,11 +120,11 @@ def add_bodies(contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32
             j -= 12 - i
             i += 1
         j += i
+        a, b = 4 * (i % 3) + i / 3, 4 * (j % 3) + j / 3
         total = wp.float64(0.0)
         for r in range(part, rows, parts):
             if contacts.row_body[env, r] == first and contacts.concave[env, r] == 0:
-                g = contacts.scaled_row[env, r]
-                total += g[i % 3, i / 3] * g[j % 3, j / 3]
+                total += rows_g[env, r, a] * rows_g[env, r, b]
         wp.atomic_add(small.s, env, place + i, place + j, total)
 
 
@@ -294,6 +296,11 @@ def whole_pairs(room: int) -> int:
     return room + -room % (PAIR // 3)
 
 
+def _numbers(rows: wp.array) -> wp.array:
+    """The twelve numbers of each matrix, (B, rows, 12), in the same memory."""
+    return wp.array(ptr=rows.ptr, dtype=wp.float64, shape=(*rows.shape, 12), device=rows.device)
+
+
 class LowRank:
     """Contact nodes, their small systems, and products with W.
 
@@ -344,8 +351,9 @@ class LowRank:
         if rows:
             self._launch(add_rows, (self.batch, self.row_lanes), [contacts, rest, active, self.row_lanes, small])
             if self.bodies:
-                inputs = [contacts, rest, active, self.lanes, small]
-                self._launch(add_bodies, (self.batch, self.bodies, self.lanes), inputs, self.lanes)
+                threads = _BODY_THREADS if self.device.is_cuda else 1
+                inputs = [contacts, _numbers(contacts.scaled_row), rest, active, threads, small]
+                self._launch(add_bodies, (self.batch, self.bodies, threads), inputs)
             self._launch(find_stiffness, (self.batch, self.lanes), [rest, active, self.lanes, small], self.lanes)
             self._launch(factor_contacts, (self.batch, self.lanes), [active, self.lanes, small], self.lanes)
 

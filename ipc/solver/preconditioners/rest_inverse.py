@@ -17,12 +17,12 @@ import numpy as np
 import warp as wp
 
 from ipc.arrays import IntArray, MatArray2d, SingleArray2d, SingleArray3d, VecArray2d, filled
+from ipc.blocks import THREADS as BLOCK_THREADS
 from ipc.bodies.layout import Layout
 from ipc.contact.contacts import Contacts
 from ipc.settings import Settings
 from ipc.solver.affine_elimination import affine_nodes
 from ipc.solver.block_jacobi import BlockJacobi
-from ipc.solver.blocks import THREADS as BLOCK_THREADS
 from ipc.solver.linear import SystemView
 from ipc.solver.preconditioners.affine_factor import affine_motion, scaled_force
 from ipc.solver.preconditioners.contact_nodes import Rest, Small, fits, rest_entry
