@@ -12,11 +12,11 @@ ARG BASE=ubuntu:24.04
 FROM ${BASE}
 ARG EXTRAS=ipc,robots
 
-# EGL draws MuJoCo's pictures without a screen: Mesa's on a CPU, the driver's own on CUDA. The last three libraries are for tetrahedra
-# (pyvista) and pictures.
+# Dr.Jit needs libatomic1, which no other package brings. EGL draws MuJoCo's pictures without a screen: Mesa's on a CPU, the driver's own
+# on CUDA. The last three libraries are for tetrahedra (pyvista) and pictures.
 RUN apt-get update \
  && apt-get install --yes --no-install-recommends python3 python3-venv \
-      libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0 libgl1 libxrender1 libgomp1 \
+      libatomic1 libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0 libgl1 libxrender1 libgomp1 \
  && rm -rf /var/lib/apt/lists/*
 
 WORKDIR /opt/raytac

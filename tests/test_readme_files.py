@@ -97,3 +97,13 @@ def test_every_example_is_listed() -> None:
 
 def test_the_readme_is_one_page() -> None:
     assert len(README.splitlines()) <= 110
+
+
+def test_the_documents_stay_readable_in_a_day() -> None:
+    """Sentences of ``docs``, without tables, code and addresses: about 150 kB."""
+    sentences = 0
+    for path in DOCS.rglob("*.md"):
+        text = re.sub(r"^```.*?^```|<!--.*?-->", "", path.read_text(encoding="utf-8"), flags=re.S | re.M)
+        lines = [line for line in LINK.sub("]", text).splitlines() if not line.lstrip().startswith("|")]
+        sentences += len("\n".join(lines).encode())
+    assert 100_000 < sentences < 165_000, f"{sentences:,} bytes: shorten a page for what is added"

@@ -64,7 +64,8 @@ class Potential:
         self.reduce = Reducer(batch, max(nodes, verts, elements), device)
         self.reduce.prepare(nodes, verts, elements)
         self.elements = filled(elasticity.Elements, device, {name: getattr(layout, name) for name in elasticity.Elements.vars})
-        volumes = {name: getattr(layout, name) for name in dilation.VolumeBlocks.vars}
+        volumes = {name: getattr(layout, name) for name in dilation.VolumeBlocks.vars if name != "corner_place"}
+        volumes["corner_place"] = dilation.corner_places(layout)
         self.volumes = filled(dilation.VolumeBlocks, device, volumes)
         self.node_body, self.node_free = ints(layout.node_body), ints(layout.node_free)
         rows = np.repeat(np.arange(nodes, dtype=np.int64), np.diff(layout.row_start))
@@ -264,7 +265,11 @@ class Potential:
             self._fill_elements(active, blocks)
         if self.volume_blocks:
             inputs, row = [self.elements, self.volumes, self.el_F, active], self.system.volume_row
-            self.launch(dilation.dilation_rows, row.shape, inputs, [row])
+            if self.device.is_cuda:
+                self.launch(dilation.dilation_rows, row.shape, inputs, [row])
+            else:
+                inputs = [*inputs, self.system.block_pair_start]
+                self.launch(dilation.block_dilation_rows, self.dilation.shape, inputs, [row])
 
     def _fill_elements(self, active: wp.array, blocks: wp.array) -> None:
         dim = self.batch, len(self.upper)
@@ -318,8 +323,11 @@ class Potential:
         self.place_vertices(self.y1, self.R, self.t, self.x1)
 
     def elastic_change(self, active: wp.array, min_det: wp.array) -> None:
-        """Elastic energy change from y to y1, and ``min_det`` (B,) ← min(min_det, det F at y1)."""
-        inputs, outputs = [self.y, self.y1, self.elements, active], [self.el_change, self.el_J1, self.el_dJ]
+        """Elastic energy change from y to y1, and ``min_det`` (B,) ← min(min_det, det F at y1).
+
+        After :meth:`evaluate_elements` at y.
+        """
+        inputs, outputs = [self.el_F, self.y1, self.elements, active], [self.el_change, self.el_J1, self.el_dJ]
         self.launch(elasticity.element_energy_change, self.el_change.shape, inputs, outputs)
         if self.volume_blocks:
             inputs = [self.elements, self.volumes, self.el_J1, self.el_dJ, active]

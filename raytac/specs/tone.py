@@ -12,11 +12,11 @@ Dr.Jit arrays.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
-from numpy.polynomial import Polynomial, legendre
+from numpy.polynomial import Legendre, Polynomial
 
 LEAST_SLOPE = 0.1
 """Least slope of a tone curve: one that falls gives two lights the same level."""
@@ -45,10 +45,10 @@ class ToneCurve:
     @cached_property
     def _powers(self) -> tuple[list[float], list[float]]:
         """Coefficients of S and of its slope by powers of u, the highest first."""
-        u = Polynomial([0.0, 1.0])
-        bend = Polynomial(legendre.leg2poly(self.coefficients or (0.0,)))(2 * u - 1)
-        curve = u + u * (1 - u) * bend
-        return [float(c) for c in curve.coef[::-1]], [float(c) for c in curve.deriv().coef[::-1]]
+        bends = _bends(len(self.coefficients))
+        curve = np.array(self.coefficients) @ bends
+        curve[-2] += 1.0  # the straight line u
+        return curve.tolist(), (curve[:-1] * np.arange(len(curve) - 1, 0, -1)).tolist()
 
     @property
     def least_slope(self) -> float:
@@ -83,6 +83,17 @@ class ToneCurve:
         inside = np.clip(level, 0, 1)
         u = self.straight(inside)
         return u + (level - inside) / _horner(self._powers[1], u)
+
+
+@cache
+def _bends(count: int) -> np.ndarray:
+    """Coefficients of u (1 − u) P_k(2u − 1), k < ``count``, (count, count + 2); highest power first."""
+    u = Polynomial([0.0, 1.0])
+    bends = np.zeros((count, count + 2))
+    for k in range(count):
+        coefficients = (u * (1 - u) * Legendre.basis(k).convert(kind=Polynomial)(2 * u - 1)).coef
+        bends[k, : len(coefficients)] = coefficients
+    return np.ascontiguousarray(bends[:, ::-1])
 
 
 def _horner(coefficients: list[float], u: Any) -> Any:

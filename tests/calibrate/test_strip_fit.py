@@ -84,7 +84,16 @@ def test_direct_light_is_the_ray_tracers(size: tuple[float, float]) -> None:
         assert np.abs(one).mean() < 0.01 * other.mean()
 
 
-@pytest.mark.parametrize(("z", "virtual"), [(-2.2, True), (-3.5, True), (-5.7, False), (-9.0, False), (-18.0, False)])
+@pytest.mark.parametrize(
+    ("z", "virtual"),
+    [
+        (-2.2, True),
+        pytest.param(-3.5, True, marks=pytest.mark.slow),
+        pytest.param(-5.7, False, marks=pytest.mark.slow),
+        pytest.param(-9.0, False, marks=pytest.mark.slow),
+        (-18.0, False),
+    ],
+)
 def test_strips_anywhere_between_coat_and_board_are_recovered(z: float, virtual: bool) -> None:
     """From 1.5 mm away and 3 mm shorter or longer: heights to 0.4 mm, lengths to 1 mm, images to a quarter of a level."""
     true_sensor = strips(z, virtual=virtual)

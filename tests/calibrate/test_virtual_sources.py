@@ -56,7 +56,7 @@ def test_long_sources_are_cut_to_what_lies_between_wall_and_view(mini: SensorSpe
         validate_sensor(dataclasses.replace(wide, lights=moved.lights(wide)))
 
 
-@pytest.mark.parametrize("z", [-1.5, -3.0, -8.0, -18.0])
+@pytest.mark.parametrize("z", [-1.5, *(pytest.param(z, marks=pytest.mark.slow) for z in (-3.0, -8.0)), -18.0])
 def test_lights_anywhere_between_coat_and_board_are_found_again(mini: SensorSpec, z: float) -> None:
     """From 1.5 mm away: heights to 0.4 mm, images to a quarter of a level; those in the gel without a wall at its back."""
     true_sensor = moved_to(mini, z)

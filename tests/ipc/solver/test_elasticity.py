@@ -67,6 +67,7 @@ def gradient_at(solver: Potential, y: np.ndarray, project: bool = False) -> np.n
 def energy_change(solver: Potential, y0: np.ndarray, y1: np.ndarray) -> float:
     for array, y in ((solver.y, y0), (solver.y1, y1)):
         array.assign(y[None])
+    solver.evaluate_elements(solver.everyone)
     solver.elastic_change(solver.everyone, wp.full(1, np.inf, dtype=wp.float64, device="cpu"))
     return float(solver.el_change.numpy().sum())
 
