@@ -48,7 +48,7 @@ class Collision:
     ) -> None:
         self.batch, self.device, self.margin, self.d_hat = batch, device, margin, d_hat
         # Threads that share the pairs of an environment. One alone adds forces up in the order of the lists.
-        self.lanes = max(32, min(1024, 2**17 // batch)) if device.is_cuda and not deterministic else 1
+        self.lanes = max(32, min(1024, 2**18 // batch)) if device.is_cuda and not deterministic else 1
         # The same where nothing is added up. Most pairs are far apart and cost little more than a thread that has none.
         self._pair_threads = max(256, 2**18 // batch) if device.is_cuda else 1
         self._block = THREADS if device.is_cuda else 1
