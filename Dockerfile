@@ -27,7 +27,8 @@ COPY scenes scenes
 COPY lights lights
 RUN python3 -m venv /opt/venv && /opt/venv/bin/pip install --no-cache-dir ".[${EXTRAS}]"
 
-ENV PATH=/opt/venv/bin:$PATH MUJOCO_GL=egl NVIDIA_DRIVER_CAPABILITIES=all
+# Dr.Jit would keep its kernels outside the volume.
+ENV PATH=/opt/venv/bin:$PATH MUJOCO_GL=egl NVIDIA_DRIVER_CAPABILITIES=all DRJIT_CACHE_DIR=/root/.cache/drjit
 WORKDIR /work
 ENTRYPOINT ["raytac"]
 CMD ["doctor"]

@@ -49,7 +49,7 @@ class ComparePhysicsArgs(SolverOptions):
         modes = parse_names(self.modes, "modes", choices) if self.modes else ()
         if self.quick:
             scenes, levels, modes, resolution = scenes[:1], PADS[:1], ("phong",), (80, 60)
-        self.prepare_warp()
+        self.prepare_warp(soft=True)
         presses, sensor = press_pads(
             scenes, levels, sensor=self.sensor, resolution=resolution, device=self.device, seed=self.seed
         )
