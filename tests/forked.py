@@ -123,6 +123,7 @@ def _become(request: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
+    gc.disable()
     for name in IMPORTED:
         try:
             importlib.import_module(name)
@@ -130,6 +131,7 @@ if __name__ == "__main__":
             traceback.print_exc()
     assert len(os.listdir("/proc/self/task")) == 1, "a fork would lack the other threads"
     gc.freeze()
+    gc.enable()
     asked = _serve()
     if asked is not None:
         _become(asked)

@@ -19,6 +19,7 @@ from raytac.cli import COMMANDS, main
 from raytac.cli.press import PressArgs
 from raytac.io.metrics import read_metrics
 from raytac.specs import load_sensor
+from tests.forked import run_forked
 
 TOUCH = """
 [object]
@@ -28,12 +29,6 @@ radius_mm = 4.0
 kind = "indent"
 depth_mm = 0.1
 """
-
-
-def run(*args: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    root = Path(__file__).parents[1]
-    env = os.environ | {"PYTHONPATH": str(root)}
-    return subprocess.run([sys.executable, "-m", "raytac", *args], cwd=cwd, env=env, capture_output=True, text=True, check=False)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +74,7 @@ def test_warp_is_heard_only_if_asked(verbose: bool, tmp_path: Path) -> None:
     scene = tmp_path / "touch.toml"
     scene.write_text(TOUCH, encoding="utf-8")
     words = ["press", str(scene), "--physics", "ipc", "--outputs", "height", "--device", "cpu", "--out", "there"]
-    done = run(*words, *(["--verbose"] if verbose else []), cwd=tmp_path)
+    done = run_forked("-m", "raytac", *words, *(["--verbose"] if verbose else []), cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     heard = done.stdout + done.stderr
     assert ("Module ipc." in heard and "Warp" in heard) is verbose
@@ -105,7 +100,7 @@ def test_unknown_commands_and_options_exit_with_2(args: list[str], capsys: pytes
 
 
 def test_a_press_without_images_from_any_folder(tmp_path: Path) -> None:
-    done = run("press", "sphere", "--outputs", "height", cwd=tmp_path)
+    done = run_forked("-m", "raytac", "press", "sphere", "--outputs", "height", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     out = tmp_path / "runs" / "press" / "sphere"
     assert done.stdout.split() == [f"runs/press/sphere/{name}" for name in ("height.npy", "metrics.json", "preview.png")]

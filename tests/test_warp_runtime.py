@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import warp as wp
 
 from raytac import warp_runtime
+from tests.forked import run_forked
 
 
 @pytest.fixture(autouse=True)
@@ -59,7 +60,9 @@ print("level", wp.config.log_level)
         ("wp.config.log_level = wp.LOG_DEBUG", wp.LOG_DEBUG, True),
     ],
 )
-def test_warp_is_quiet_unless_asked(before: str, level: int, lists: bool) -> None:
-    run = subprocess.run([sys.executable, "-c", _PRINTED.format(before=before)], capture_output=True, text=True, check=True)
+def test_warp_is_quiet_unless_asked(before: str, level: int, lists: bool, tmp_path: Path) -> None:
+    (tmp_path / "press.py").write_text(_PRINTED.format(before=before))
+    run = run_forked("press.py", cwd=tmp_path)
+    assert run.returncode == 0, run.stderr
     assert f"level {level}" in run.stdout and ("load on device" in run.stdout + run.stderr) == lists
     assert ("Warp" in run.stdout + run.stderr) == lists

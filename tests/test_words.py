@@ -20,7 +20,7 @@ NOT_PROSE = {"docs/glossary.md"}
 @pytest.fixture(scope="module")
 def library() -> dict[str, list[ast.AST]]:
     """Nodes of every file's syntax tree."""
-    return {name: house.nodes_of(path) for name, path in house.modules(ROOT).items()}
+    return house.parsed(house.modules(ROOT))
 
 
 def test_docstrings_begin_with_no_question_word(library: dict[str, list[ast.AST]]) -> None:

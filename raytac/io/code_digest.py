@@ -8,7 +8,7 @@ import importlib.util
 import subprocess
 import sys
 from collections.abc import Iterable
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 WITHIN = ("raytac.gel", "raytac.optics", "raytac.shapes")
@@ -31,14 +31,20 @@ def module_sources(roots: Iterable[str]) -> dict[str, Path]:
         if source is None:
             continue
         sources[name] = source
-        for node in ast.walk(ast.parse(sources[name].read_bytes())):
-            imported: list[str] = []
-            if isinstance(node, ast.Import):
-                imported = [alias.name for alias in node.names]
-            elif isinstance(node, ast.ImportFrom) and node.module:
-                imported = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-            waiting += [name for name in imported if (name + ".").startswith(tuple(package + "." for package in WITHIN))]
+        waiting += _imported(source.read_bytes())
     return sources
+
+
+@lru_cache(maxsize=1024)
+def _imported(source: bytes) -> tuple[str, ...]:
+    """Modules of ``WITHIN`` that a source may import, and names that it imports from them."""
+    names: list[str] = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return tuple(name for name in names if (name + ".").startswith(tuple(package + "." for package in WITHIN)))
 
 
 def _source(name: str) -> Path | None:

@@ -10,6 +10,7 @@ import platform
 import re
 import sys
 from collections.abc import Iterable, Mapping
+from functools import cache
 from pathlib import Path
 
 from raytac.errors import InputError
@@ -29,14 +30,19 @@ _KEY = re.compile(r"[A-Za-z0-9_\-]+(\.[A-Za-z0-9_\-]+)*")
 def versions(distributions: Iterable[str] = VERSIONED) -> dict[str, str]:
     """``versions.python`` and ``versions.<distribution>`` of what is installed."""
     result = {"versions.python": platform.python_version()}
-    for name in distributions:
-        try:
-            result[f"versions.{name}"] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
+    result |= {f"versions.{name}": version for name in distributions if (version := _version(name)) is not None}
     if "versions.raytac" not in result:  # a plain checkout that was never installed
         result["versions.raytac"] = sys.modules["raytac"].__version__
     return result
+
+
+@cache
+def _version(distribution: str) -> str | None:
+    """Version of what is installed, looked up once a process; None if it is not."""
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def check_metrics(values: Mapping[str, object]) -> dict[str, Metric]:

@@ -101,10 +101,7 @@ def coat_compliance(mesh: PadMesh, gelpad: GelpadSpec) -> np.ndarray:
 
 def cached_compliance(mesh: PadMesh, gelpad: GelpadSpec) -> np.ndarray:
     """``coat_compliance``, float32, from the user's cache; warns where that is damaged."""
-    arrays = [mesh.tets.vertices, mesh.tets.tets, mesh.bonded, mesh.coat_vertices]
-    if mesh.volume_blocks is not None:
-        arrays += [mesh.volume_blocks, np.array(mesh.own_volume)]
-    basis = repr(gelpad), *(array.tobytes() for array in arrays), code_digest(__name__, mesh_compliance.__name__)
+    basis = *mesh_compliance.compliance_basis(mesh, gelpad), code_digest(__name__, mesh_compliance.__name__)
     digest = hashlib.sha256(repr(basis).encode()).hexdigest()[:24]
     folder = cache_folder("markers")
     path = None if folder is None else folder / f"compliance-{digest}.npy"

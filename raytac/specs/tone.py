@@ -87,7 +87,7 @@ class ToneCurve:
 
 @cache
 def _bends(count: int) -> np.ndarray:
-    """Coefficients of u (1 − u) P_k(2u − 1), k < ``count``, (count, count + 2); highest power first."""
+    """Coefficients of u (1 − u) P_k(2u − 1), k < ``count``, the highest power first."""
     u = Polynomial([0.0, 1.0])
     bends = np.zeros((count, count + 2))
     for k in range(count):

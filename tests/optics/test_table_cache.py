@@ -192,23 +192,23 @@ from pathlib import Path
 from types import SimpleNamespace
 from raytac.optics.taxim.cache import keep
 from tests.optics.test_table_cache import made_up
-for k in range(40):
+for k in range(20):
     keep(made_up(int(sys.argv[1])), Path(sys.argv[2]) / str(k))
 """
 
 
 def test_writers_at_once_leave_whole_tables(tmp_path: Path) -> None:
     """Readers find a whole table or none at any time, whoever is writing."""
-    writers = [subprocess.Popen([sys.executable, "-c", _WRITER, str(k), str(tmp_path)]) for k in (1, 2, 3)]
+    writers = [subprocess.Popen([sys.executable, "-c", _WRITER, str(k), str(tmp_path)]) for k in (1, 2)]
     read = 0
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         while any(writer.poll() is None for writer in writers):
-            read += sum(table_cache.cached(tmp_path / str(k)) is not None for k in range(40))
-        assert [writer.returncode for writer in writers] == [0, 0, 0] and read > 0
-        found = [table_cache.cached(tmp_path / str(k)) for k in range(40)]
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(str(k) for k in range(40))
-    assert {table.provenance["source"] for table in found if table} <= {"made up 1", "made up 2", "made up 3"} and all(found)
+            read += sum(table_cache.cached(tmp_path / str(k)) is not None for k in range(20))
+        assert [writer.returncode for writer in writers] == [0, 0] and read > 0
+        found = [table_cache.cached(tmp_path / str(k)) for k in range(20)]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(str(k) for k in range(20))
+    assert {table.provenance["source"] for table in found if table} <= {"made up 1", "made up 2"} and all(found)
 
 
 def test_a_cache_that_cannot_be_written_is_done_without(

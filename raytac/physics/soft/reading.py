@@ -18,7 +18,7 @@ from raytac.physics.soft.clearance import BarrierClearance, hat_arrays
 from raytac.physics.soft.coat_state import CoatState
 from raytac.physics.soft.coat_surface import CoatSurface
 from raytac.physics.soft.correction import normal_kernels
-from raytac.physics.soft.correction.mesh_compliance import coat_compliance
+from raytac.physics.soft.correction.mesh_compliance import correction_compliances
 from raytac.physics.soft.correction.normal import ContactSampler, NormalCorrection
 from raytac.physics.soft.correction.plane_waves import node_lines
 from raytac.physics.soft.correction.tangential import TangentialCorrection
@@ -175,12 +175,8 @@ class SoftReader:
 
     @cached_property
     def compliances(self) -> tuple[np.ndarray, np.ndarray]:
-        """Compliance of the mesh's coat, and of one whose sides may not move outwards.
-
-        They take a while (``coat_compliance``).
-        """
-        continued = coat_compliance(self.mesh, self._gelpad, rollers=True, along=(0, 1, 2))
-        return coat_compliance(self.mesh, self._gelpad)[0], continued
+        """``correction_compliances`` of the mesh; the first of a mesh take a while."""
+        return correction_compliances(self.mesh, self._gelpad)
 
 
 def _copied(array: wp.array) -> np.ndarray:

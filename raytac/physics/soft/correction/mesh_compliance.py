@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from itertools import product
 
@@ -14,6 +15,38 @@ _SAME_PLACE = 1e-9
 """Vertices nearer than this are mirror images [m]."""
 _SAME = 1e-9
 """Relative difference of two stiffnesses that is rounding."""
+_MOST_BYTES = 1 << 27
+"""Memory of ``correction_compliances`` that a process keeps."""
+_kept: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+"""Last of them, by all that they depend on."""
+
+
+def compliance_basis(mesh: PadMesh, gelpad: GelpadSpec) -> tuple[str | bytes, ...]:
+    """All that a compliance depends on, but for the code."""
+    arrays = [mesh.tets.vertices, mesh.tets.tets, mesh.bonded, mesh.coat_vertices]
+    if mesh.volume_blocks is not None:
+        arrays += [mesh.volume_blocks, np.array(mesh.own_volume)]
+    return repr(gelpad), *(array.tobytes() for array in arrays)
+
+
+def correction_compliances(mesh: PadMesh, gelpad: GelpadSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Compliance of the coat, and of one whose sides may not move outwards.
+
+    Shapes (3, V, V), for forces along z, and (3, 3, V, V). Both take as long as a quarter of a press of the coarse pad: those of the
+    last meshes are kept and shared, read-only.
+    """
+    key = hashlib.sha256(repr(compliance_basis(mesh, gelpad)).encode()).hexdigest()
+    if key not in _kept:
+        made = coat_compliance(mesh, gelpad)[0], coat_compliance(mesh, gelpad, rollers=True, along=(0, 1, 2))
+        for array in made:
+            array.flags.writeable = False
+        size = sum(array.nbytes for array in made)
+        if size > _MOST_BYTES:
+            return made
+        while size + sum(array.nbytes for pair in _kept.values() for array in pair) > _MOST_BYTES:
+            del _kept[next(iter(_kept))]
+        _kept[key] = made
+    return _kept[key]
 
 
 def coat_compliance(mesh: PadMesh, gelpad: GelpadSpec, *, rollers: bool = False, along: tuple[int, ...] = (2,)) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ from raytac.gel.interpolate import sampled
 from raytac.gel.products import Products
 from raytac.gel.surface import make_grid
 from raytac.physics.bonded_layer import layer_compliance, layer_spread
+from raytac.physics.soft.correction import mesh_compliance
 from raytac.physics.soft.correction.cosine_series import CosineSeries
-from raytac.physics.soft.correction.mesh_compliance import coat_compliance, rest_stiffness
+from raytac.physics.soft.correction.mesh_compliance import coat_compliance, correction_compliances, rest_stiffness
 from raytac.physics.soft.correction.plane_waves import CosineSum
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
 from raytac.physics.soft.settings import Correction
@@ -274,3 +276,28 @@ def test_a_sum_of_cosines_by_quarters_is_that_of_all_nodes(ny: int, nx: int) -> 
     expected = along[1].synthesis(y) @ (values * factor) @ along[0].synthesis(x).T
     expected[1] = 0.0
     np.testing.assert_allclose(out.numbers.numpy(), expected, rtol=0, atol=2e-5)
+
+
+def test_pads_of_one_mesh_share_their_compliances_and_others_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[object] = []
+
+    def counted(*args: Any, **options: Any) -> np.ndarray:
+        made.append(args)
+        return coat_compliance(*args, **options)
+
+    monkeypatch.setattr(mesh_compliance, "_kept", {})
+    monkeypatch.setattr(mesh_compliance, "coat_compliance", counted)
+    level = PadLevel(2.5e-3, 3, 1.5, 1.5, 5e-5)
+    first = correction_compliances(pad_mesh(GELPAD, level), GELPAD)
+    again = correction_compliances(pad_mesh(GELPAD, level), GELPAD)
+    assert again is first and len(made) == 2
+    np.testing.assert_array_equal(first[0], coat_compliance(pad_mesh(GELPAD, level), GELPAD)[0])
+    with pytest.raises(ValueError, match="read-only"):
+        first[1][0] = 0.0
+    softer = replace(GELPAD, youngs_modulus=0.5 * GELPAD.youngs_modulus)
+    np.testing.assert_allclose(correction_compliances(pad_mesh(GELPAD, level), softer)[0], 2.0 * first[0], rtol=1e-9)
+    blocks = replace(level, block=(2, 2, 1))
+    assert not np.array_equal(correction_compliances(pad_mesh(GELPAD, blocks), GELPAD)[0], first[0]) and len(made) == 6
+    monkeypatch.setattr(mesh_compliance, "_MOST_BYTES", 3 * sum(array.nbytes for array in first))
+    correction_compliances(pad_mesh(GELPAD, replace(level, cell=4e-3)), GELPAD)
+    assert correction_compliances(pad_mesh(GELPAD, level), GELPAD) is not first, "the oldest go first"

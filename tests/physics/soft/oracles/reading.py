@@ -12,7 +12,7 @@ import numpy as np
 from raytac.gel.coat_mesh import DeformedCoat
 from raytac.gel.interpolate import hat_matrix, sampled
 from raytac.gel.surface import GelSurface, PadGrid, make_grid, rest_height
-from raytac.physics.soft.correction.mesh_compliance import coat_compliance
+from raytac.physics.soft.correction.mesh_compliance import correction_compliances
 from raytac.physics.soft.mesh import PadMesh
 from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
 from raytac.shapes.part import Part, mesh_part
@@ -251,8 +251,7 @@ class SoftReader:
         """Stages of the correction, made at the first contact: the compliance takes a while."""
         assert self.correction is not None
         x, y = self._fine_grid.x, self._fine_grid.y
-        compliance = coat_compliance(self.mesh, self._gelpad)[0]
-        continued = coat_compliance(self.mesh, self._gelpad, rollers=True, along=(0, 1, 2))
+        compliance, continued = correction_compliances(self.mesh, self._gelpad)
         normal = NormalCorrection(self._surface, self._gelpad, x, y, compliance[2], continued[2, 2], self.correction)
         tangential = TangentialCorrection(normal, self._gelpad, compliance, continued)
         return normal, ContactSampler(normal, self.grid.x, self.grid.y), tangential
