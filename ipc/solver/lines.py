@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from ipc.arrays import IntArray, MatArray2d, VecArray2d, filled
+from ipc.arrays import IntArray, MatArray2d, Vec4Array2d, filled
 from ipc.bodies.layout import Layout
 from ipc.solver.affine_elimination import positive_inverse
 from ipc.solver.linear import SystemView
@@ -35,7 +35,7 @@ class Lines:
 
     ``link`` (n,): place of the block that couples a node with the one before, or of its transpose −1 less that, or −2³¹ for the first of a
     line.    ``shared_start`` (n+1,), ``own``, ``other``: pairs of a volume block and the node, and of the block and the node before.
-    ``lower`` (B, n): L.
+    ``lower``, ``upper``, ``inverse`` (B, 3 n): columns of L, its rows, and rows of D⁻¹, four numbers each, the last 0.
     """
 
     node: IntArray
@@ -43,12 +43,14 @@ class Lines:
     shared_start: IntArray
     own: IntArray
     other: IntArray
-    lower: MatArray2d
+    lower: Vec4Array2d
+    upper: Vec4Array2d
+    inverse: Vec4Array2d
 
 
 @wp.kernel
 def factor_lines(lines: Lines, system: SystemView, active: IntArray, inverse: MatArray2d):
-    """Replace the diagonal blocks ``inverse`` (B, N) by D⁻¹, and fill ``lower``."""
+    """Replace the diagonal blocks ``inverse`` (B, N) by D⁻¹, and fill the lines' factors."""
     env = wp.tid()
     if active[env] == 0:
         return
@@ -64,27 +66,33 @@ def factor_lines(lines: Lines, system: SystemView, active: IntArray, inverse: Ma
                 A += wp.outer(system.volume_row[env, lines.own[m]], system.volume_row[env, lines.other[m]])
             L = A * inverse[env, lines.node[k - 1]]
             D -= L * wp.transpose(A)
-        inverse[env, lines.node[k]] = positive_inverse(D)
-        lines.lower[env, k] = L
+        D = positive_inverse(D)
+        inverse[env, lines.node[k]] = D
+        for a in range(3):
+            lines.lower[env, 3 * k + a] = wp.vec4d(L[0, a], L[1, a], L[2, a], wp.float64(0.0))
+            lines.upper[env, 3 * k + a] = wp.vec4d(L[a, 0], L[a, 1], L[a, 2], wp.float64(0.0))
+            lines.inverse[env, 3 * k + a] = wp.vec4d(D[a, 0], D[a, 1], D[a, 2], wp.float64(0.0))
 
 
 @wp.func
-def apply_lines(lines: Lines, inverse: MatArray2d, env: wp.int32, r: VecArray2d, z: VecArray2d) -> wp.float64:
+def apply_lines(lines: Lines, env: wp.int32, r: Vec4Array2d, z: Vec4Array2d) -> wp.float64:
     """z = M⁻¹ r on the unknowns; returns r·z."""
+    lower, upper, inverse, source, result = lines.lower[env], lines.upper[env], lines.inverse[env], r[env], z[env]
     n = lines.node.shape[0]
-    y, total = wp.vec3d(), wp.float64(0.0)
+    y, total = wp.vec4d(), wp.vec4d()
     for k in range(n):
-        y = r[env, lines.node[k]] - lines.lower[env, k] * y
-        z[env, lines.node[k]] = y
-    y = wp.vec3d()
+        y = source[lines.node[k]] - (y[0] * lower[3 * k] + y[1] * lower[3 * k + 1] + y[2] * lower[3 * k + 2])
+        result[lines.node[k]] = y
+    y = wp.vec4d()
     for step in range(n):
         k = n - 1 - step
         i = lines.node[k]
-        v = inverse[env, i] * z[env, i] - y
-        z[env, i] = v
-        total += wp.dot(r[env, i], v)
-        y = wp.transpose(lines.lower[env, k]) * v
-    return total
+        v = result[i]
+        v = v[0] * inverse[3 * k] + v[1] * inverse[3 * k + 1] + v[2] * inverse[3 * k + 2] - y
+        result[i] = v
+        total += wp.cw_mul(source[i], v)
+        y = v[0] * upper[3 * k] + v[1] * upper[3 * k + 1] + v[2] * upper[3 * k + 2]
+    return total[0] + total[1] + total[2]
 
 
 def make_lines(layout: Layout, where: NDArray[np.integer], batch: int, device: wp.Device) -> Lines:
@@ -108,7 +116,8 @@ def make_lines(layout: Layout, where: NDArray[np.integer], batch: int, device: w
         starts.append(len(own))
     values = {"node": node, "link": link, "shared_start": starts, "own": own, "other": other}
     lines = filled(Lines, device, {name: np.asarray(value, np.int32) for name, value in values.items()})
-    lines.lower = wp.zeros((batch, len(node)), dtype=wp.mat33d, device=device)
+    for name in ("lower", "upper", "inverse"):
+        setattr(lines, name, wp.zeros((batch, 3 * len(node)), dtype=wp.vec4d, device=device))
     return lines
 
 

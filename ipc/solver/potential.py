@@ -19,7 +19,7 @@ from ipc.contact.collision import Collision
 from ipc.reduce import BLOCK, MAX, MIN, SUM, Reducer
 from ipc.settings import Settings
 from ipc.solver import dilation, dynamics, elasticity, frames, reuse
-from ipc.solver.halves import fold_rows
+from ipc.solver.halves import copy_half, fold_rows
 from ipc.solver.linear import SystemView, find_volume_motions, push_blocks, push_rows, slice_rows, turn_rows
 
 _SLICE = 32
@@ -141,8 +141,8 @@ class Potential:
         self.system.R = self.R
         self.system.project = self.project
         self.mirrors = True
-        self._kept: Any = None
-        """Blocks without contact rows (:mod:`ipc.solver.reuse`)."""
+        self._filled: Any = None
+        """Mask of :mod:`ipc.solver.reuse`."""
 
     def launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list | None = None) -> None:
         """Launch a kernel on the device of the batch."""
@@ -256,13 +256,11 @@ class Potential:
                 *(self.el_F, self.el_mckl, active),
             ]
             self.launch(elasticity.block_hessian, dim, inputs, [blocks])
-        elif self._kept is not None:
-            inputs = [self.el_F, self.project, active]
-            self.launch(reuse.choose_stale, self.batch, inputs, [self._kept_F, self._filled, self._stale])
-            self._fill_elements(self._stale, self._kept)
-            self.launch(reuse.copy_blocks, dim, [self.upper, self.mirrors, self._kept, active], [blocks])
         else:
-            self._fill_elements(active, blocks)
+            if self._filled is not None:
+                inputs = [self.el_F, self.project, active]
+                self.launch(reuse.choose_stale, self.batch, inputs, [self._filled_F, self._filled, self._stale])
+            self._fill_elements(active if self._filled is None else self._stale, blocks)
         if self.volume_blocks:
             inputs, row = [self.elements, self.volumes, self.el_F, active], self.system.volume_row
             if self.device.is_cuda:
@@ -281,7 +279,7 @@ class Potential:
 
     def forget_matrix(self) -> None:
         """Let the next :meth:`fill_matrix` compute all blocks."""
-        if self._kept is not None:
+        if self._filled is not None:
             self._filled.fill_(reuse.NONE)
 
     def turn_rows(self, active: wp.array) -> None:
@@ -302,6 +300,11 @@ class Potential:
         self.system.above, self.system.above_start = (
             wp.array(values, dtype=wp.int32, device=self.device) for values in (where[above], starts)
         )
+        system, pairs = self.system, self.system.volume_row.shape[1]
+        system.half_rows, system.half_diagonal, system.half_volume = (
+            wp.zeros((self.batch, size), dtype=wp.vec4d, device=self.device)
+            for size in (3 * len(above), 3 * len(layout.node_rest), pairs)
+        )
         # Gripped nodes push the unknowns with whole rows, and affine bodies are eliminated by whole blocks.
         self.mirrors = self.grips > 0 or bool((layout.vert_count > 1).any())
         if not self.mirrors:
@@ -309,12 +312,14 @@ class Potential:
             self.upper = wp.array(upper[unknown[upper[:, 0]]], dtype=wp.int32, device=self.device)
             places = _element_places(layout, rows, where, unknown)
             self.places = wp.array(places, dtype=wp.int32, device=self.device)
-            self._kept, self._kept_F = wp.zeros_like(self.system.blocks), wp.zeros_like(self.el_F)
+            self._filled_F = wp.zeros_like(self.el_F)
             self._filled, self._stale = (wp.full(self.batch, reuse.NONE, dtype=wp.int32, device=self.device) for _ in range(2))
 
     def fold_rows(self, active: wp.array) -> None:
-        """Add the rows of :meth:`turn_rows` to the blocks, if halves are used."""
+        """Copy half of the matrix and add the rows of :meth:`turn_rows`, if halves are used."""
         if self.system.above_start is not None:
+            size = max(len(self.system.free), self.system.half_volume.shape[1])
+            self.launch(copy_half, (self.batch, size), [self.system, active])
             self.launch(fold_rows, (self.batch,), [self.system, self.collision.contacts, active])
 
     def try_step(self, alpha: wp.array) -> None:

@@ -1,7 +1,7 @@
 """Elastic blocks of an earlier Newton iteration, while no element has deformed much since.
 
-Only where contact rows are folded into the blocks (:mod:`ipc.solver.halves`): a copy without them is kept. The rows of volume blocks, which
-carry most of λ, are those of the state as it is. A step begins with new blocks, so that it is a function of its start alone.
+Only in the worlds of :mod:`ipc.solver.halves` without grips and affine bodies. The rows of volume blocks, which carry most of λ, are those
+of the state as it is. A step begins with new blocks, so that it is a function of its start alone.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.arrays import IntArray, IntArray2d, MatArray2d
+from ipc.arrays import IntArray, MatArray2d
 
 wp.set_module_options({"enable_backward": False})
 
@@ -44,13 +44,3 @@ def choose_stale(F: MatArray2d, project: IntArray, active: IntArray, filled_F: M
         filled[env] = project[env]
         for e in range(F.shape[1]):
             filled_F[env, e] = F[env, e]
-
-
-@wp.kernel
-def copy_blocks(upper: IntArray2d, mirrors: wp.bool, kept: MatArray2d, active: IntArray, blocks: MatArray2d):
-    """Copy the blocks ``upper``, on and above the diagonal, and with ``mirrors`` those below it."""
-    env, u = wp.tid()
-    if active[env] != 0:
-        blocks[env, upper[u, 1]] = kept[env, upper[u, 1]]
-        if mirrors:
-            blocks[env, upper[u, 2]] = kept[env, upper[u, 2]]
