@@ -77,12 +77,12 @@ VIEW_STEPS = np.array([1e-2, 1e-5])
 """Steps of the derivatives by the camera's distance [mm] and distortion."""
 REST_FACTOR = 8
 """The image at rest is fitted as means of so many pixels squared."""
-LEAST_LIGHT = 0.125
-"""Least light at rest over that of its photograph (a guess): fits are pushed back below it.
+LEAST_SHARE = 0.1
+"""Least share of a channel's light at rest that a colour matrix leaves it (a guess).
 
-A colour matrix can make light negative, and no gain of a sensor makes that bright."""
-LACK = 300.0
-"""Residual [levels] of light that is a whole photograph's below ``LEAST_LIGHT``."""
+It may make light negative where no press was, and no gain of a sensor makes that bright. So fits are pushed back below this share."""
+LACK = 3000.0
+"""Residual [levels] of light that is a channel's mean below that."""
 
 
 @dataclass(frozen=True)
@@ -252,14 +252,9 @@ class DirectFit:
         return linear, rest * (1 + self.r2 * (a1 + a2 * self.r2)) + black, black
 
     def lack(self, p: LightParameters, total: list[np.ndarray]) -> np.ndarray:
-        """Light at rest less ``LEAST_LIGHT`` of its photograph's, (K, 3) ≤ 0 [levels]."""
-        return LACK * np.minimum(total[2] * self._share_of_rest(p) - LEAST_LIGHT, 0)
-
-    def _share_of_rest(self, p: LightParameters) -> np.ndarray:
-        """Share (K, 3) of the photograph at rest that light 1 gives."""
-        gamma, *stray, a1, a2 = p.response
-        black = np.array(stray) * darkest(self.darkest, gamma, p.curve)
-        return (1 + self.r2 * (a1 + a2 * self.r2)) / (decode(self.rest_real, gamma, p.curve) - black)
+        """Light at rest that is below the least share, over its channel's mean, (K, 3) [levels]."""
+        unmixed = total[2] @ np.linalg.inv(p.mixing).T
+        return LACK * np.minimum(total[2] - LEAST_SHARE * unmixed, 0) / np.maximum(unmixed.mean(0), _LEAST)
 
     def blocks(self, p: LightParameters) -> list[tuple[str, int]]:
         """Name (of ``SIGMA``) of every parameter of the vector's blocks, and how many follow."""
@@ -373,10 +368,15 @@ class DirectFit:
         jac = np.zeros((last + slopes, off.size), np.float32)
         rest_jac = np.zeros((len(jac), rest_off.size), np.float32)
 
-        def column(k: int, *parts: np.ndarray, mixing: np.ndarray = mixing) -> None:
+        lack = rest_off[1]
+        mean = np.maximum((total[2] @ np.linalg.inv(p.mixing).T).mean(0), _LEAST)
+
+        def column(k: int, *parts: np.ndarray, mixing: np.ndarray = mixing, of_matrix: bool = False) -> None:
             pressed, flat, still = (part @ mixing for part in parts)
             jac[k] = (gains[0] * pressed - gains[1] * flat).ravel()
-            rest_jac[k] = (gains[2] * still).ravel()
+            unmixed = np.zeros_like(still) if of_matrix else np.broadcast_to(parts[2], still.shape)
+            lacking = (LACK * (lack < 0) * (still - LEAST_SHARE * unmixed) - lack * unmixed.mean(0)) / mean
+            rest_jac[k] = np.stack([gains[2] * still, lacking]).ravel()
 
         none, by_led = (np.zeros((1, 3)),) * 3, {} if self.extra is None else self.extra.by_led
         for led in range(count):
@@ -397,7 +397,7 @@ class DirectFit:
                 other, other_rest = self._residuals(changed, total)
                 jac[k], rest_jac[k] = ((other - off) / STEP).ravel(), ((other_rest - rest_off) / STEP).ravel()
         for k, (row, other) in enumerate(np.argwhere(OFF_DIAGONAL)):
-            column(first + 9 + k, *unmixed, mixing=np.outer(np.eye(3)[other], np.eye(3)[row]))
+            column(first + 9 + k, *unmixed, mixing=np.outer(np.eye(3)[other], np.eye(3)[row]), of_matrix=True)
         by_geometry = [self._by_geometry(p, part) for part in leds]
 
         def change(part: int, new: PixelGeometry) -> np.ndarray:
@@ -430,11 +430,10 @@ class DirectFit:
         return by_point, by_normal
 
     def _gains(self, p: LightParameters, total: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Slopes (M, 3) of levels by light pressed and by light at rest, negated; (2, K, 3) at rest."""
+        """Slopes of levels by light pressed, by light at rest (negated), and of the rest image."""
         linear, rest, black = self._linear(p, total)
         lit, still = (level_slope(light, p.response[0], p.curve) * (light - black) for light in (linear, rest))
-        lacking = LACK * self._share_of_rest(p) * (self.lack(p, total) < 0)
-        return lit / total[0], lit / total[1], np.stack([still / total[2], lacking])
+        return lit / total[0], lit / total[1], still / total[2]
 
     def step(self, state: FitState) -> Callable[[float], FitState]:
         """The normal equations at ``state``; the result gives the trial state of any damping."""
