@@ -468,7 +468,7 @@ def test_the_prior_that_serves_presses_elsewhere_best_is_chosen(sensor: SensorSp
     shots, true = direct(sensor, circles(8))
     moved = dataclasses.replace(true.p, leds=true.p.leds + np.array([3.0, 0, 0, 0, 0.3, 0, 0, 0]))
     start = with_parameters(sensor, moved, shots.background)
-    settings = FitSettings(fixed=("gamma", "slope", "stray", "mix", "tone"))
+    settings = FitSettings(fixed=("gamma", "slope", "stray", "mix", "tone", "distance", "distortion"))
     found, errors = choose_strength(start, shots, settings, candidates={"tied-dark": {"prior": 1e7}, "free": {"prior": 30.0}})
     assert found == "free" and errors["free"] < 0.6 * errors["tied-dark"], "a clear difference beats custom"
     usual = {"tied-dark": {"prior": 30.0}, "free": {"prior": 60.0}}

@@ -23,7 +23,7 @@ from tests.calibrate.test_light_fit import RADIUS, circles, direct, traced
 from tests.optics.test_strip import PANEL, STRIP, line_irradiance, rectangle_irradiance
 
 DIRECT = RayTraced(shadows=False, bounce=False)
-SETTINGS = FitSettings(fixed=("gamma", "tone", "stray", "slope", "distance", "distortion"), samples=(150, 100), prior=1.0)
+SETTINGS = FitSettings(fixed=("gamma", "tone", "stray", "slope", "mix", "distance", "distortion"), samples=(150, 100), prior=1.0)
 
 
 def strips(z: float, length: float = 18.0, height: float = 1.0, virtual: bool = False) -> SensorSpec:
