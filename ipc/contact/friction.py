@@ -608,8 +608,9 @@ def worst_share(
     # outputs
     worst: FloatArray,
 ):
-    """Raise ``worst`` to the largest relative change of the forces on one body, one block of threads a body.
+    """Raise ``worst`` to the largest relative change of the forces on one body.
 
+    One block of threads a body.
     ``change`` has the lengths of the changes at vertices [N] (``size_of_change``); a body's vertices begin at ``vert_start``.
     """
     env, body, lane = wp.tid()

@@ -1,4 +1,4 @@
-"""Dense symmetric positive definite matrices, factored, solved and inverted by one block of threads each.
+"""Dense positive definite matrices, factored, solved and inverted by a block of threads each.
 
 A = Uᵀ U is computed by panels of ``PANEL`` rows (a left-looking Cholesky factorisation), of which two share their sums over the rows above.
 A thread works on columns, two at a time, and keeps these sums in registers while it runs down the rows, ``TOGETHER`` at a time: memory is
@@ -42,7 +42,10 @@ mat66d = wp.types.matrix(shape=(PANEL, PANEL), dtype=wp.float64)
 def panel_sums(
     u: FloatArray3d, y: FloatArray3d, env: wp.int32, row: wp.int32, c: wp.int32, d: wp.int32, first: wp.int32, last: wp.int32
 ) -> mat62d:
-    """Σ u[k, i] y[k, j] over ``first`` <= k < ``last``, whole panels; rows i of a panel, columns j = c, d."""
+    """Σ u[k, i] y[k, j] over ``first`` <= k < ``last``; rows i of a panel, columns j = c, d.
+
+    The rows above, k, are whole panels.
+    """
     sums = mat62d()
     for top in range(first, last, TOGETHER):
         v, w = mat36d(), mat32d()

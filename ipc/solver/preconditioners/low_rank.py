@@ -100,9 +100,9 @@ def add_rows(contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32, 
 
 @wp.kernel
 def add_bodies(contacts: Contacts, rows_g: FloatArray3d, rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
-    """S += the upper half of Σ g gᵀ of each affine body's rows; ``rows_g`` (B, rows, 12) are the numbers of their g.
+    """S += the upper half of Σ g gᵀ of each affine body's rows.
 
-    Nearly all rows belong to a body: its twelve unknowns are added up by entries of S, and not by rows, which would all meet there.
+    ``rows_g`` (B, rows, 12) has the numbers of their g. Nearly all rows belong to a body: its twelve unknowns are added up by entries of S, and not by rows, which would all meet there.
     """
     env, body, lane = wp.tid()
     if active[env] == 0 or not fits(small, env):
@@ -154,7 +154,10 @@ def give_up(small: Small, env: wp.int32, lane: wp.int32, lanes: wp.int32):
 
 @wp.kernel(launch_bounds=(LANES, 1))
 def find_stiffness(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
-    """K = (J C Jᵀ)⁻¹ where the pads' contact nodes have changed, one block of threads an environment."""
+    """K = (J C Jᵀ)⁻¹ where the pads' contact nodes have changed.
+
+    One block of threads an environment.
+    """
     env, lane = wp.tid()
     if active[env] == 0 or not fits(small, env) or small.known[env] == small.pads[env]:
         return

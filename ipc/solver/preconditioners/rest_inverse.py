@@ -96,9 +96,9 @@ def place_running(running: IntArray, place: IntArray, total_running: IntArray):
 def multiply_tiles(
     matrix: SingleArray3d, x: SingleArray2d, x_first: wp.int32, y_first: wp.int32, total_running: IntArray, y: SingleArray3d
 ):
-    """y = Σ_c y[c] = x · matrix in tiles, patch by patch, of the environments that run, which come first.
+    """y = x · matrix in tiles, patch by patch, with a sum y[c] for each part of the inputs.
 
-    Each part c of the inputs is summed apart.
+    Of the environments that run, which come first.
     """
     both, i, j = wp.tid()
     part, patch = both / matrix.shape[0], both % matrix.shape[0]
