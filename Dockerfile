@@ -12,11 +12,11 @@ ARG BASE=ubuntu:24.04
 FROM ${BASE}
 ARG EXTRAS=ipc,robots
 
-# EGL draws MuJoCo's pictures without a screen: Mesa's on a CPU, the driver's own on CUDA. The last three libraries are for tetrahedra
-# (pyvista) and pictures.
+# Dr.Jit needs libatomic1, which no other package brings. EGL draws MuJoCo's pictures without a screen: Mesa's on a CPU, the driver's own
+# on CUDA. The last three libraries are for tetrahedra (pyvista) and pictures.
 RUN apt-get update \
  && apt-get install --yes --no-install-recommends python3 python3-venv \
-      libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0 libgl1 libxrender1 libgomp1 \
+      libatomic1 libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0 libgl1 libxrender1 libgomp1 \
  && rm -rf /var/lib/apt/lists/*
 
 WORKDIR /opt/raytac
@@ -27,7 +27,8 @@ COPY scenes scenes
 COPY lights lights
 RUN python3 -m venv /opt/venv && /opt/venv/bin/pip install --no-cache-dir ".[${EXTRAS}]"
 
-ENV PATH=/opt/venv/bin:$PATH MUJOCO_GL=egl NVIDIA_DRIVER_CAPABILITIES=all
+# Dr.Jit would keep its kernels outside the volume.
+ENV PATH=/opt/venv/bin:$PATH MUJOCO_GL=egl NVIDIA_DRIVER_CAPABILITIES=all DRJIT_CACHE_DIR=/root/.cache/drjit
 WORKDIR /work
 ENTRYPOINT ["raytac"]
 CMD ["doctor"]

@@ -67,7 +67,9 @@ def main(args: Args) -> None:
             tick=lambda stage, cost: print(f"{stage}: cost {cost:.4g}", flush=True),
         )
         unseen = shots.take(test)
-        images = images_of(models.modes["raytrace"], sensor, unseen, models.circles(unseen), models.fitted.state.slopes)
+        images = images_of(
+            models.modes["raytrace"], models.fitted.sensor, unseen, models.circles(unseen), models.fitted.state.slopes
+        )
         real = unseen.presses[args.shown]
         metrics["contact_mae"] = float(np.abs(images - unseen.presses)[unseen.distance(sensor) < 1.0].mean())
         coin = TactileSensor("gelsight_mini", outputs=("rgb", "height"), device=args.device, seed=args.seed).press("coin")

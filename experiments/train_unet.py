@@ -94,7 +94,7 @@ def rendered(sweep: SweepSpec, device: str) -> Presses:
     """All sound presses of ``sweep``."""
     plan = DatasetPlan(sweep)
     renderer, parts = ShardRenderer(RenderJob(plan, device, 64 if device == "cuda" else 8)), []
-    for shard in Progress(range(plan.shards), desc="presses"):
+    for shard in Progress(range(plan.shards), desc="presses", unit="shard"):
         arrays = renderer.render(shard).arrays
         if arrays:
             parts.append([arrays[name] for name in ("height", "contact", "rgb")])
@@ -125,7 +125,7 @@ def trained(network: Any, maps: Any, presses: Presses, rest: np.ndarray, args: A
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, args.steps)
     images = torch.from_numpy(presses.rgb)
     background, still = torch.from_numpy(rest).to(device).float(), torch.zeros_like(maps[:1]).float()
-    progress = Progress(range(args.steps), desc="fit")
+    progress = Progress(range(args.steps), desc="fit", unit="step")
     for _ in progress:
         rows = torch.randint(len(maps), (args.batch,), generator=draws)
         seen = maps[rows.to(device)].float()

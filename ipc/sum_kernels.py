@@ -12,9 +12,9 @@ from __future__ import annotations
 import warp as wp
 
 from ipc.arrays import FloatArray, FloatArray2d, IntArray, MatArray2d, VecArray2d
+from ipc.blocks import block_max, block_sum
 from ipc.contact.contacts import Contacts
 from ipc.contact.friction import Lagged, friction_slope_ratio, sliding
-from ipc.solver.blocks import block_max, block_sum
 
 wp.set_module_options({"enable_backward": False})
 

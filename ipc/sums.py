@@ -12,10 +12,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from ipc.arrays import filled
+from ipc.blocks import THREADS
 from ipc.bodies.body import AffineBody, Body, rotation_matrix
 from ipc.bodies.layout import Layout
 from ipc.contact import friction
-from ipc.solver.blocks import THREADS
 from ipc.solver.potential import Potential
 from ipc.sum_kernels import BodySums, PairSums, SumLayout, sum_bodies, sum_pairs
 

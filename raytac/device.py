@@ -18,6 +18,7 @@ __all__ = [
     "cuda_device_count",
     "cuda_driver_version",
     "cuda_missing",
+    "library_missing",
     "llvm_library",
     "optix_library",
     "resolve_device",
@@ -111,6 +112,15 @@ def total_memory(device: str) -> int:
     if driver.cuDeviceTotalMem_v2(ctypes.byref(size), handle):
         raise BackendError("the CUDA driver does not tell the device's memory; run `raytac doctor`")
     return size.value
+
+
+def library_missing() -> str:
+    """Library of the system that Dr.Jit's wheel needs and that is not here; empty if all are."""
+    if sys.platform == "linux" and _load(("libatomic.so.1",)) is None:
+        return (
+            "Dr.Jit needs libatomic.so.1 of the system: apt install libatomic1 (Debian, Ubuntu) or dnf install libatomic (Fedora)"
+        )
+    return ""
 
 
 @functools.cache

@@ -18,7 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from raytac.device import LLVM_NAMED_BY_USER, cuda_missing, llvm_library
+from raytac.device import LLVM_NAMED_BY_USER, cuda_missing, library_missing, llvm_library
 from raytac.installation import foreign_ipc
 from raytac.io.metrics import versions
 
@@ -194,6 +194,7 @@ _GPU = "import mujoco_warp; print('mujoco-warp imported')"
 _ENVS = "import gymnasium, mink; print('gymnasium', gymnasium.__version__)"
 
 PROBES = (
+    Probe("system", "print('libraries that Dr.Jit needs of the system are here')", True, "", library_missing),
     Probe(
         "mitsuba-cuda", _TRACE.format(device="cuda"), False,
         "needs an NVIDIA GPU and driver with OptiX (in a container: the 'graphics' driver capability); the CPU does without",

@@ -21,10 +21,14 @@ def quiet_warp(quiet: bool = True) -> None:
     start_warp()
 
 
-def has_compiled_kernels() -> bool:
-    """True if Warp's cache holds kernels of raytac, of any version; after ``quiet_warp``."""
+def has_compiled_kernels(*, solver: bool = False) -> bool:
+    """True if Warp's cache holds kernels of raytac, of any version; after ``quiet_warp``.
+
+    ``solver``: also those of the soft pad's contact solver.
+    """
     if foreign_ipc() is not None:
         return True
     import warp as wp
 
-    return any(Path(wp.config.kernel_cache_dir or "").glob("wp_raytac*"))
+    cache = Path(wp.config.kernel_cache_dir or "")
+    return all(any(cache.glob(f"wp_{package}*")) for package in ("raytac", "ipc")[: 1 + solver])

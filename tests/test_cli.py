@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -263,3 +264,18 @@ def test_paths_that_are_not_utf_8_are_written(tmp_path: Path, locale: dict[str, 
     assert ended.returncode == 0 and ended.stderr.count(b"\n") == 1, ended.stderr
     assert {path.name for path in folder.iterdir()} == {"rgb.png", "frame.exr", "height.npy", "preview.png", "metrics.json"}
     assert read_metrics(folder / "metrics.json")["scene"] == "sc\\udce8ne"
+
+
+def test_a_system_without_a_library_of_the_renderer_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fails(name: str) -> None:
+        raise NameError("name '_drjit_ext' is not defined")
+
+    monkeypatch.setattr("raytac.cli.importlib", SimpleNamespace(import_module=fails))
+    with pytest.raises(NameError):  # no library is missing: the error is another one
+        main(["press", "coin"])
+    monkeypatch.setattr("raytac.device._load", lambda names: None)
+    assert main(["press", "coin"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("raytac: error: ") and "apt install libatomic1" in said and said.count("\n") == 1

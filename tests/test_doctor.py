@@ -48,7 +48,7 @@ def test_nothing_is_started_where_there_is_nothing_to_try() -> None:
 
 
 def test_what_every_installation_has_is_required() -> None:
-    assert {p.name for p in doctor.PROBES if p.required} == {"mujoco", "exr", "assets", "figures, meshes", "warp"}
+    assert {p.name for p in doctor.PROBES if p.required} == {"system", "mujoco", "exr", "assets", "figures, meshes", "warp"}
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,8 @@ def test_who_named_llvm(by_user: str | None) -> None:
         "from raytac.doctor import PROBES, run_probe\n"
         "from dataclasses import replace\n"
         "assert os.environ['DRJIT_LIBLLVM_PATH'] and 'DRJIT_LIBOPTIX_PATH' not in os.environ\n"
-        "print(run_probe(replace(PROBES[1], code='print()')).detail)"
+        "(llvm,) = (probe for probe in PROBES if probe.name == 'mitsuba-llvm')\n"
+        "print(run_probe(replace(llvm, code='print()')).detail)"
     )
     env |= {"PYTHONPATH": str(Path(doctor.__file__).parents[1]), "DRJIT_LIBOPTIX_PATH": ""}
     env |= {} if by_user is None else {"DRJIT_LIBLLVM_PATH": by_user and library}

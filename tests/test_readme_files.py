@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -97,3 +98,25 @@ def test_every_example_is_listed() -> None:
 
 def test_the_readme_is_one_page() -> None:
     assert len(README.splitlines()) <= 110
+
+
+def test_the_documents_stay_readable_in_a_day() -> None:
+    """Sentences of ``docs``, without tables, code and addresses: about 150 kB."""
+    sentences = 0
+    for path in DOCS.rglob("*.md"):
+        text = re.sub(r"^```.*?^```|<!--.*?-->", "", path.read_text(encoding="utf-8"), flags=re.S | re.M)
+        lines = [line for line in LINK.sub("]", text).splitlines() if not line.lstrip().startswith("|")]
+        sentences += len("\n".join(lines).encode())
+    assert 100_000 < sentences < 165_000, f"{sentences:,} bytes: shorten a page for what is added"
+
+
+def test_the_container_is_made_of_what_is_here() -> None:
+    text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    copied = [name for line in re.findall(r"^COPY (.+)$", text, flags=re.M) for name in line.split()[:-1]]
+    assert {"pyproject.toml", "raytac", "ipc", "scenes", "lights"} <= set(copied)
+    assert [name for name in copied if not (ROOT / name).exists()] == []
+    known = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    extras = {extra for names in re.findall(r"EXTRAS=([\w,]+)", text) for extra in names.split(",")}
+    assert {"ipc", "robots", "gpu"} <= extras <= set(known)
+    # What Dr.Jit loads beyond a bare image, and its kernels in the volume that the file tells to mount.
+    assert "libatomic1" in text and "-v raytac-cache:/root/.cache" in text and "DRJIT_CACHE_DIR=/root/.cache/" in text

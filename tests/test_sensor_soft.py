@@ -180,3 +180,13 @@ def test_the_correction_of_the_surface_is_a_choice() -> None:
     assert 5e-6 < np.abs(heights[0] - heights[1]).max() < 0.1e-3
     with pytest.raises(InputError, match=r"correction = 3: must be a Correction"):
         Ipc(correction=3)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("physics", "outputs", "shares"), [("ipc", ("rgb",), 1), ("ipc", ("height",), 0), ("rigid", ("rgb",), 0)]
+)
+def test_images_share_the_cores_with_the_solver(physics, outputs, shares, monkeypatch: pytest.MonkeyPatch) -> None:
+    shared = []
+    monkeypatch.setattr("raytac.optics.runtime.share_cores", lambda: shared.append(1))
+    TactileSensor(outputs=outputs, physics=physics, pitch=0.2e-3, device="cpu").load(SCENE)
+    assert len(shared) == shares

@@ -24,4 +24,11 @@ def test_the_command_says_once_that_kernels_are_compiled(
         assert [record.getMessage() for record in caplog.records] == ["compiling kernels: up to a minute, once on a machine"]
         (tmp_path / "wp_raytac.gel_0123456").mkdir()
         SolverOptions().prepare_warp()
-    assert has_compiled_kernels() and len(caplog.records) == 1
+        assert has_compiled_kernels() and len(caplog.records) == 1
+        # A soft pad needs the solver's kernels too, which take longer.
+        assert not has_compiled_kernels(solver=True)
+        SolverOptions().prepare_warp(soft=True)
+        assert len(caplog.records) == 2
+        (tmp_path / "wp_ipc.solver.pcg_0123456").mkdir()
+        SolverOptions().prepare_warp(soft=True)
+    assert has_compiled_kernels(solver=True) and len(caplog.records) == 2

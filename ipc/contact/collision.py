@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 
 from ipc.arrays import filled
+from ipc.blocks import THREADS
 from ipc.bodies.layout import Layout
 from ipc.broad_phase import lists
 from ipc.broad_phase.trees import Trees, trees_pay
@@ -47,7 +48,10 @@ class Collision:
     ) -> None:
         self.batch, self.device, self.margin, self.d_hat = batch, device, margin, d_hat
         # Threads that share the pairs of an environment. One alone adds forces up in the order of the lists.
-        self.lanes = max(32, min(1024, 2**17 // batch)) if device.is_cuda and not deterministic else 1
+        self.lanes = max(32, min(1024, 2**18 // batch)) if device.is_cuda and not deterministic else 1
+        # The same where nothing is added up. Most pairs are far apart and cost little more than a thread that has none.
+        self._pair_threads = max(256, 2**18 // batch) if device.is_cuda else 1
+        self._block = THREADS if device.is_cuda else 1
         self._sort = deterministic and device.is_cuda
         pairs = [(index, int(a), int(b)) for index, (a, b) in enumerate(layout.pairs)]
         mesh_pairs = [pair for pair in pairs if not layout.half_space[pair[2]]]
@@ -63,7 +67,7 @@ class Collision:
         if not device.is_cuda:
             self.candidates.near_count = self._zeros((2, batch), wp.int32)
         verts = int(layout.vert_start[-1])
-        self._reach = Reach(batch, verts, d_hat, device)
+        self._reach = Reach(batch, verts, d_hat, self._pair_threads, device)
         self._size_candidates(512, 1024)
         self.contacts = contacts.Contacts()
         for name in ("count", "row_count", "open_count"):
@@ -354,7 +358,7 @@ class Collision:
         """
         if self._meshes:
             for ee, items in ((False, self.candidates.pt), (True, self.candidates.ee)):
-                threads = items.shape[1] if self.device.is_cuda else 1
+                threads = min(items.shape[1], self._pair_threads)
                 inputs = [x, dx, self.surface, self.candidates, ee, slack, floor, reach, active, threads]
                 self._launch(ccd.ccd_pairs, (self.batch, threads), inputs, [alpha])
         if self.planes:
@@ -397,8 +401,9 @@ class Collision:
         self._launch(friction.size_of_change, vertices, [self._change, active], [self._change_size])
         self._reduce(self._change_size, active, SUM, changed)
         self._launch(friction.share_of_change, self.batch, [self._force, active], [changed, sum_changed])
-        inputs = [self.lagged, self._change_size, self._vert_start, self.vert_body, active]
-        self._launch(friction.worst_share, (self.batch, len(self._vert_start) - 1), inputs, [worst_changed])
+        inputs = [self.lagged, self._change_size, self._vert_start, self.vert_body, active, self._block]
+        dim = (self.batch, len(self._vert_start) - 1, self._block)
+        wp.launch(friction.worst_share, dim, inputs, [worst_changed], device=self.device, block_dim=self._block)
 
     def guard_slips(self, x: wp.array, dx: wp.array, start: wp.array, active: wp.array, halt: wp.array) -> None:
         """Choose the curvature of friction after a Newton step dx from x (B, V), in the mask (B,).

@@ -38,6 +38,7 @@ from __future__ import annotations
 import warp as wp
 
 from ipc.arrays import FloatArray, FloatArray2d, IntArray, IntArray2d, MatArray2d, QuatArray2d, VecArray2d
+from ipc.blocks import block_sum
 from ipc.contact.contacts import Contacts, push_row
 
 wp.set_module_options({"enable_backward": False})
@@ -603,23 +604,29 @@ def worst_share(
     vert_start: IntArray,
     vert_body: IntArray,
     active: IntArray,
+    threads: wp.int32,
     # outputs
     worst: FloatArray,
 ):
     """Raise ``worst`` to the largest relative change of the forces on one body.
 
+    One block of threads a body.
     ``change`` has the lengths of the changes at vertices [N] (``size_of_change``); a body's vertices begin at ``vert_start``.
     """
-    env, body = wp.tid()
+    env, body, lane = wp.tid()
     if active[env] == 0:
         return
-    size, total = wp.float64(0.0), wp.float64(0.0)
-    for v in range(vert_start[body], vert_start[body + 1]):
-        size += change[env, v]
+    part = wp.float64(0.0)
+    for v in range(vert_start[body] + lane, vert_start[body + 1], threads):
+        part += change[env, v]
+    size = block_sum(part)
     if size == wp.float64(0.0):
         return
-    for i in range(wp.min(lagged.count[env], lagged.limit.shape[1])):
+    part = wp.float64(0.0)
+    for i in range(lane, wp.min(lagged.count[env], lagged.limit.shape[1]), threads):
         first, last = lagged.verts[env, i][0], lagged.verts[env, i][3]
         if vert_body[first] == body or vert_body[wp.max(last, 0)] == wp.where(last < 0, -1, body):
-            total += lagged.limit[env, i]
-    wp.atomic_max(worst, env, size / wp.max(total, wp.float64(1.0e-300)))
+            part += lagged.limit[env, i]
+    total = block_sum(part)
+    if lane == 0:
+        wp.atomic_max(worst, env, size / wp.max(total, wp.float64(1.0e-300)))

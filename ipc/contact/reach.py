@@ -68,18 +68,19 @@ def set_reference(x: VecArray2d, dx: VecArray2d, far: IntArray, reference: VecAr
 
 
 @wp.kernel
-def measure_pairs(x: VecArray2d, surface: Surface, ee: wp.bool, far: IntArray, candidates: Candidates):
-    """Distances of the candidates at x."""
-    env, i = wp.tid()
-    if far[env] == 0 or i >= pairs_of(candidates, ee, env):
+def measure_pairs(x: VecArray2d, surface: Surface, ee: wp.bool, far: IntArray, threads: wp.int32, candidates: Candidates):
+    """Distances of the candidates at x, by (environment, thread)."""
+    env, first = wp.tid()
+    if far[env] == 0:
         return
-    v = pair_vertices(surface, ee, pair_at(candidates, ee, env, i))
-    x0, x1, x2, x3 = x[env, v[0]], x[env, v[1]], x[env, v[2]], x[env, v[3]]
-    gap = wp.length(separation(pair_coefficients(ee, x0, x1, x2, x3), x0, x1, x2, x3))
-    if ee:
-        candidates.ee_gap[env, i] = gap
-    else:
-        candidates.pt_gap[env, i] = gap
+    for i in range(first, pairs_of(candidates, ee, env), threads):
+        v = pair_vertices(surface, ee, pair_at(candidates, ee, env, i))
+        x0, x1, x2, x3 = x[env, v[0]], x[env, v[1]], x[env, v[2]], x[env, v[3]]
+        gap = wp.length(separation(pair_coefficients(ee, x0, x1, x2, x3), x0, x1, x2, x3))
+        if ee:
+            candidates.ee_gap[env, i] = gap
+        else:
+            candidates.pt_gap[env, i] = gap
 
 
 @wp.kernel
@@ -107,10 +108,11 @@ class Reach:
     Args:
         verts: vertices of an environment, V.
         d_hat: [m].
+        threads: most threads that share the pairs of an environment.
     """
 
-    def __init__(self, batch: int, verts: int, d_hat: float, device: wp.Device) -> None:
-        self.batch, self.device, self._limit = batch, device, DRIFT * d_hat
+    def __init__(self, batch: int, verts: int, d_hat: float, threads: int, device: wp.Device) -> None:
+        self.batch, self.device, self._limit, self._threads = batch, device, DRIFT * d_hat, threads
         self._reference = wp.zeros((batch, verts), dtype=wp.vec3d, device=device)
         self._size = wp.zeros((batch, verts), dtype=wp.float64, device=device)
         self._far, self._any_far = (wp.zeros(n, dtype=wp.int32, device=device) for n in (batch, 1))
@@ -137,7 +139,8 @@ class Reach:
         self._launch(set_reference, x.shape, [x, dx, self._far], [self._reference, self._size, candidates.moved])
         self._reduce(self._size, self._far, MAX, candidates.moved)
         for ee, pairs in ((False, candidates.pt), (True, candidates.ee)):
-            self._launch(measure_pairs, pairs.shape, [x, surface, ee, self._far], [candidates])
+            threads = min(pairs.shape[1], self._threads)
+            self._launch(measure_pairs, (self.batch, threads), [x, surface, ee, self._far, threads], [candidates])
             if not self.device.is_cuda:
                 self._launch(list_near, (self.batch,), [ee, self._far], [candidates])
 

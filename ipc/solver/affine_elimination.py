@@ -27,9 +27,9 @@ import numpy as np
 import warp as wp
 
 from ipc.arrays import IntArray, IntArray2d, MatArray2d, VecArray2d, filled
+from ipc.blocks import THREADS, wait_for_block
 from ipc.bodies.layout import Layout
 from ipc.contact.contacts import Contacts, mat34d, rows_of
-from ipc.solver.blocks import THREADS, wait_for_block
 from ipc.solver.linear import SystemView, row_column
 
 wp.set_module_options({"enable_backward": False})

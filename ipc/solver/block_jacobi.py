@@ -5,13 +5,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from ipc.arrays import IntArray, MatArray2d, VecArray2d
 from ipc.bodies.layout import Layout
 from ipc.contact.contacts import Contacts, rows_of
 from ipc.solver.affine_elimination import AffineElimination, Elimination, fits, positive_inverse, soft_part, soft_share
 from ipc.solver.linear import SystemView, row_column
+from ipc.solver.lines import factor_lines, make_lines
 
 wp.set_module_options({"enable_backward": False})
 
@@ -99,6 +104,12 @@ class BlockJacobi:
         self.affine = AffineElimination(layout, batch, lanes, device) if fits(layout, batch) else None
         self.elimination = self.affine.view if self.affine else Elimination()
         """Arrays for :mod:`ipc.solver.pcg_block`, empty where nothing is eliminated."""
+        self.lines: Any = None
+        """Lines of nodes, where one thread solves a system (:mod:`ipc.solver.pcg_serial`)."""
+
+    def use_lines(self, layout: Layout, where: NDArray[np.integer]) -> None:
+        """Take lines of nodes together; ``where`` (K,): place of every block of the matrix."""
+        self.lines = make_lines(layout, where, len(self.inverse), self.inverse.device)
 
     def update(self, system: SystemView, contacts: Contacts, rows: int, active: wp.array) -> None:
         """Take in the matrix of the active environments; ``rows`` is the largest row count."""
@@ -107,7 +118,10 @@ class BlockJacobi:
         if rows:
             inputs = [system, contacts, self.affine is not None, active, self.lanes]
             wp.launch(diagonal_rows, dim=(dim[0], self.lanes), inputs=inputs, outputs=[self.inverse], device=device)
-        wp.launch(invert_blocks, dim=dim, inputs=[system.free, active], outputs=[self.inverse], device=device)
+        if self.lines is None:
+            wp.launch(invert_blocks, dim=dim, inputs=[system.free, active], outputs=[self.inverse], device=device)
+        else:
+            wp.launch(factor_lines, dim=dim[0], inputs=[self.lines, system, active], outputs=[self.inverse], device=device)
         if self.affine:
             self.affine.update(system, contacts, rows, self.inverse, active)
 

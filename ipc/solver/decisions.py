@@ -345,7 +345,8 @@ def conclude(
     """End an iteration: environments converge, give up, or have their friction lagged again.
 
     Friction is renewed within a step's first solve after each of its first ``renewals`` Newton iterations, and ``calm_renewals`` times
-    after one of at most ``calm`` [m] with all frames in place; the first says nothing, since friction's curvature at rest holds it back.
+    after a plain one of at most ``calm`` [m] with all frames in place; the first says nothing, since friction's curvature at rest holds it
+    back.
     """
     env = wp.tid()
     if f.halt[0] != 0:
@@ -378,14 +379,13 @@ def conclude(
     if was_active != 0 and d.since_lag[env] >= max_newton:
         d.active[env] = 0
     # Friction of a step's first solve follows its contacts: solved with that of the step's start, it would be solved for nothing.
-    if friction != 0 and max_relags > 0 and d.plain[env] != 0 and d.active[env] != 0 and d.relags[env] == 0:
+    if friction != 0 and max_relags > 0 and was_active != 0 and d.active[env] != 0 and d.relags[env] == 0:
         if d.since_lag[env] <= renewals:
             d.pending[env] = 1
-        elif (
-            d.progress[env] >= wp.float64(1.0) and d.size[env] <= calm and d.renewed[env] < calm_renewals and d.since_lag[env] > 1
-        ):
-            d.pending[env] = 1
-            d.renewed[env] = d.renewed[env] + 1
+        elif d.plain[env] != 0 and d.size[env] <= calm and d.renewed[env] < calm_renewals and d.since_lag[env] > 1:
+            if d.progress[env] >= wp.float64(1.0):
+                d.pending[env] = 1
+                d.renewed[env] = d.renewed[env] + 1
     # Where Newton gave up, forces are no better known after another lag; the first two may still help it on.
     if was_active != 0 and d.active[env] == 0 and friction != 0 and max_relags > 0:
         if d.converged[env] != 0 or (d.relags[env] < 2 and d.relags[env] < max_relags):

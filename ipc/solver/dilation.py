@@ -29,9 +29,12 @@ gathers from the blocks around it, so that sums have one order.
 
 from __future__ import annotations
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from ipc.arrays import FloatArray, FloatArray2d, IntArray, MatArray2d, VecArray2d
+from ipc.bodies.layout import Layout
 from ipc.solver.elasticity import Elements, cofactor, deformation
 
 wp.set_module_options({"enable_backward": False})
@@ -44,7 +47,7 @@ class VolumeBlocks:
     ``block_tet_start`` (Q+1,), ``block_tet``: elements of each block.    ``block_volume`` (Q,): V_b [m³].
     ``block_lam`` [Pa], ``block_rest`` (Q,): λ − λ' and a.
     ``pair_block``, ``pair_node`` (S,).    ``pair_corner_start`` (S+1,), ``pair_corner``: 4·element + a for each element of the block at
-    the node.
+    the node.    ``corner_place`` (4 T,): the pair of a corner of an element, −1 without a block.
     """
 
     block_tet_start: IntArray
@@ -56,6 +59,14 @@ class VolumeBlocks:
     pair_node: IntArray
     pair_corner_start: IntArray
     pair_corner: IntArray
+    corner_place: IntArray
+
+
+def corner_places(layout: Layout) -> NDArray[np.int32]:
+    """``corner_place`` of :class:`VolumeBlocks`."""
+    places = np.full(4 * len(layout.tets), -1, np.int32)
+    places[layout.pair_corner] = np.repeat(np.arange(len(layout.pair_node)), np.diff(layout.pair_corner_start))
+    return places
 
 
 @wp.kernel
@@ -96,6 +107,31 @@ def dilation_rows(elements: Elements, volumes: VolumeBlocks, el_F: MatArray2d, a
         slope += elements.volume[e] * (cofactor(el_F[env, e]) * elements.grads[e, volumes.pair_corner[k] - 4 * e])
     b = volumes.pair_block[s]
     q[env, s] = wp.sqrt(volumes.block_lam[b] / volumes.block_volume[b]) * slope
+
+
+@wp.kernel
+def block_dilation_rows(
+    elements: Elements, volumes: VolumeBlocks, el_F: MatArray2d, active: IntArray, block_pair_start: IntArray, q: VecArray2d
+):
+    """q as of :func:`dilation_rows`, block by block: a cofactor an element, not one a corner.
+
+    ``block_pair_start`` (Q+1,): first pair of each block.
+    """
+    env, b = wp.tid()
+    if active[env] == 0:
+        return
+    rows = q[env]
+    for s in range(block_pair_start[b], block_pair_start[b + 1]):
+        rows[s] = wp.vec3d()
+    for k in range(volumes.block_tet_start[b], volumes.block_tet_start[b + 1]):
+        e = volumes.block_tet[k]
+        C, volume = cofactor(el_F[env, e]), elements.volume[e]
+        for a in range(4):
+            s = volumes.corner_place[4 * e + a]
+            rows[s] = rows[s] + volume * (C * elements.grads[e, a])
+    scale = wp.sqrt(volumes.block_lam[b] / volumes.block_volume[b])
+    for s in range(block_pair_start[b], block_pair_start[b + 1]):
+        rows[s] = scale * rows[s]
 
 
 @wp.kernel

@@ -19,9 +19,13 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Masses:
-    """Mass matrix [kg] in the block pattern, ``inertia`` with drives [kg], ``drag`` [kg/s]."""
+    """Mass matrix [kg] in the block pattern, ``inertia`` with drives [kg], ``drag`` [kg/s].
+
+    Its blocks that are not 0: those of row i are ``block`` from ``row_start[i]`` on.
+    """
 
     row_start: IntArray
+    block: IntArray
     col: IntArray
     mass: FloatArray
     inertia: FloatArray
@@ -105,11 +109,11 @@ def node_gradient(
     inertia_scale = wp.float64(1.0) / (h * h)
     g = gradient[env, i]
     elastic = wp.length(g)
-    for k in range(masses.row_start[i], masses.row_start[i + 1]):
+    for m in range(masses.row_start[i], masses.row_start[i + 1]):
+        k = masses.block[m]
         j = masses.col[k]
-        if masses.inertia[k] != wp.float64(0.0):
-            pull = (masses.inertia[k] * inertia_scale) * (y[env, j] - local_target[env, j])
-            g += pull + (masses.drag[k] / h) * (y[env, j] - local_start[env, j])
+        pull = (masses.inertia[k] * inertia_scale) * (y[env, j] - local_target[env, j])
+        g += pull + (masses.drag[k] / h) * (y[env, j] - local_start[env, j])
     contact, place = wp.vec3d(), 3 * summed_place[i]
     if place >= 0:
         contact = wp.vec3d(summed[env, place], summed[env, place + 1], summed[env, place + 2])
@@ -145,12 +149,12 @@ def inertia_change(
     h = dt[env] + wp.float64(0.0)
     inertia_scale = wp.float64(1.0) / (h * h)
     f = wp.vec3d()
-    for k in range(masses.row_start[i], masses.row_start[i + 1]):
+    for m in range(masses.row_start[i], masses.row_start[i + 1]):
+        k = masses.block[m]
         j = masses.col[k]
-        if masses.inertia[k] != wp.float64(0.0):
-            mean = half * (y0[env, j] + y1[env, j])
-            pull = (masses.inertia[k] * inertia_scale) * (mean - local_target[env, j])
-            f += pull + (masses.drag[k] / h) * (mean - local_start[env, j])
+        mean = half * (y0[env, j] + y1[env, j])
+        pull = (masses.inertia[k] * inertia_scale) * (mean - local_target[env, j])
+        f += pull + (masses.drag[k] / h) * (mean - local_start[env, j])
     change[env, i] = wp.dot(y1[env, i] - y0[env, i], f)
 
 
@@ -167,7 +171,8 @@ def kinetic_energy(v: VecArray2d, masses: Masses, energy: FloatArray2d):
     """½ v·M v node by node [J]."""
     env, i = wp.tid()
     f = wp.vec3d()
-    for k in range(masses.row_start[i], masses.row_start[i + 1]):
+    for m in range(masses.row_start[i], masses.row_start[i + 1]):
+        k = masses.block[m]
         f += masses.mass[k] * v[env, masses.col[k]]
     energy[env, i] = wp.float64(0.5) * wp.dot(v[env, i], f)
 

@@ -471,7 +471,7 @@ def mirror_blocks(upper: IntArray2d, active: IntArray, blocks: MatArray2d):
 
 @wp.kernel
 def element_energy_change(
-    y0: VecArray2d,
+    el_F: MatArray2d,
     y1: VecArray2d,
     elements: Elements,
     active: IntArray,
@@ -480,7 +480,7 @@ def element_energy_change(
     det: FloatArray2d,
     det_change: FloatArray2d,
 ):
-    """Ψ(y1) − Ψ(y0) of every element [J], J at y1, and its change.
+    """Ψ(y1) − Ψ(y0) of every element [J], J at y1, and its change; ``el_F``: F at y0.
 
     Sums of differences keep digits.
 
@@ -489,7 +489,7 @@ def element_energy_change(
     env, e = wp.tid()
     if active[env] == 0:
         return
-    F0 = deformation(env, e, y0, elements)
+    F0 = el_F[env, e] + wp.mat33d()
     F1 = deformation(env, e, y1, elements)
     if elements.volume_block[e] >= 0:
         det_change[env, e] = volume_change(F0, F1)

@@ -2,7 +2,7 @@
 
 They are for a CPU, and worlds without free bodies. A block above the diagonal is read once and multiplies twice. Conjugate gradients
 would multiply by each contact row many times; a row at nodes of one face or edge of a pad fits the matrix, and is added to its blocks
-instead.
+instead. Rows of blocks are copied out as vectors of four numbers, which a processor multiplies at once; so are vectors of unknowns.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -12,19 +12,60 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.arrays import IntArray, VecArray2d
+from ipc.arrays import IntArray, Vec4Array2d
 from ipc.contact.contacts import Contacts, rows_of
-from ipc.solver.linear import SystemView, add_row, row_column, row_weight
+from ipc.solver.linear import SystemView, row_column, row_weight
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def place_above(system: SystemView, i: wp.int32, j: wp.int32) -> wp.int32:
-    """Place of the block of unknowns i < j, −1 where the pattern has none."""
+def head(v: wp.vec4d) -> wp.vec3d:
+    """The first three numbers."""
+    return wp.vec3d(v[0], v[1], v[2])
+
+
+@wp.func
+def filled_up(v: wp.vec3d) -> wp.vec4d:
+    """Three numbers and 0."""
+    return wp.vec4d(v[0], v[1], v[2], wp.float64(0.0))
+
+
+@wp.func
+def row_of(A: wp.mat33d, a: wp.int32) -> wp.vec4d:
+    return wp.vec4d(A[a, 0], A[a, 1], A[a, 2], wp.float64(0.0))
+
+
+@wp.kernel
+def copy_half(system: SystemView, active: IntArray):
+    """Copy blocks and volume rows out, by node or pair."""
+    env, i = wp.tid()
+    if active[env] == 0:
+        return
+    if i < system.half_volume.shape[1]:
+        q = wp.vec3d()
+        if system.free[system.pair_node[i]] != 0:
+            q += system.volume_row[env, i]
+        system.half_volume[env, i] = filled_up(q)
+    if i < system.free.shape[0]:
+        if system.free[i] == 0:
+            return
+        rows, diagonal, blocks = system.half_rows[env], system.half_diagonal[env], system.blocks[env]
+        D = blocks[system.diagonal[i]]
+        for a in range(3):
+            diagonal[3 * i + a] = row_of(D, a)
+        for m in range(system.above_start[i], system.above_start[i + 1]):
+            A = blocks[system.above[m]]
+            for a in range(3):
+                rows[3 * m + a] = row_of(A, a)
+
+
+@wp.func
+def number_above(system: SystemView, i: wp.int32, j: wp.int32) -> wp.int32:
+    """Number of the block of unknowns i < j among those above, −1 where the pattern has none."""
     for k in range(system.above_start[i], system.above_start[i + 1]):
         if system.col[system.above[k]] == j:
-            return system.above[k]
+            return k
     return -1
 
 
@@ -36,7 +77,7 @@ def fits_blocks(system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int
     for a in range(4):
         for b in range(4):
             if nodes[a] >= 0 and nodes[b] > nodes[a]:
-                if place_above(system, nodes[a], nodes[b]) < 0:
+                if number_above(system, nodes[a], nodes[b]) < 0:
                     return False
     return True
 
@@ -51,18 +92,20 @@ def add_outer(
     a: wp.int32,
     b: wp.int32,
     place: wp.int32,
+    rows: Vec4Array2d,
 ):
-    """Block += Σ w q_a q_bᵀ of the rows from ``first`` to before ``end``."""
+    """Block ``place`` of ``rows`` += Σ w q_a q_bᵀ of the rows from ``first`` to before ``end``."""
     total = wp.mat33d()
     for r in range(first, end):
         row = contacts.node_row[env, r]
         total += wp.outer(row_weight(system, contacts, env, r) * row_column(row, a), row_column(row, b))
-    system.blocks[env, place] = system.blocks[env, place] + total
+    for k in range(3):
+        rows[env, 3 * place + k] = rows[env, 3 * place + k] + row_of(total, k)
 
 
 @wp.kernel
 def fold_rows(system: SystemView, contacts: Contacts, active: IntArray):
-    """Add turned rows to the blocks on and above the diagonal, and list those that do not fit.
+    """Add turned rows to the blocks of :func:`copy_half`, and list those that do not fit.
 
     Rows of one pair follow each other, and are added together.
     """
@@ -82,11 +125,11 @@ def fold_rows(system: SystemView, contacts: Contacts, active: IntArray):
                 end += 1
             for a in range(4):
                 for b in range(4):
-                    if nodes[a] >= 0 and nodes[b] >= nodes[a]:
-                        place = system.diagonal[nodes[a]]
-                        if nodes[b] > nodes[a]:
-                            place = place_above(system, nodes[a], nodes[b])
-                        add_outer(system, contacts, env, first, end, a, b, place)
+                    if nodes[a] >= 0 and nodes[b] == nodes[a]:
+                        add_outer(system, contacts, env, first, end, a, b, nodes[a], system.half_diagonal)
+                    elif nodes[a] >= 0 and nodes[b] > nodes[a]:
+                        place = number_above(system, nodes[a], nodes[b])
+                        add_outer(system, contacts, env, first, end, a, b, place, system.half_rows)
         else:
             contacts.open_row[env, count] = first
             count += 1
@@ -95,33 +138,66 @@ def fold_rows(system: SystemView, contacts: Contacts, active: IntArray):
 
 
 @wp.func
-def multiply_half(system: SystemView, contacts: Contacts, env: wp.int32, p: VecArray2d, out: VecArray2d) -> wp.float64:
+def add_open_row(
+    system: SystemView, contacts: Contacts, env: wp.int32, r: wp.int32, p: Vec4Array2d, out: Vec4Array2d
+) -> wp.float64:
+    """out += w q (q·p) of the turned row r with weight w; returns w (q·p)²."""
+    nodes, row = contacts.row_nodes[env, r], contacts.node_row[env, r]
+    body, g, s = contacts.row_body[env, r] + 0, contacts.body_row[env, r], wp.float64(0.0)
+    for k in range(4):
+        if nodes[k] >= 0:
+            s += wp.dot(row_column(row, k), head(p[env, nodes[k]]))
+        if body >= 0:
+            s += wp.dot(row_column(g, k), head(p[env, body + k]))
+    w = row_weight(system, contacts, env, r)
+    for k in range(4):
+        if nodes[k] >= 0:
+            out[env, nodes[k]] = out[env, nodes[k]] + filled_up((w * s) * row_column(row, k))
+        if body >= 0:
+            out[env, body + k] = out[env, body + k] + filled_up((w * s) * row_column(g, k))
+    return w * s * s
+
+
+@wp.func
+def multiply_half(system: SystemView, contacts: Contacts, env: wp.int32, p: Vec4Array2d, out: Vec4Array2d) -> wp.float64:
     """out = H p on the unknowns, else 0, after :func:`fold_rows`; returns p·out.
 
     p is 0 elsewhere.
     """
-    total = wp.float64(0.0)
-    blocks, volume_row, x, y = system.blocks[env], system.volume_row[env], p[env], out[env]
+    total, zero = wp.vec4d(), wp.float64(0.0)
+    rows, diagonal, volume = system.half_rows[env], system.half_diagonal[env], system.half_volume[env]
+    x, y = p[env], out[env]
     for i in range(x.shape[0]):
-        y[i] = blocks[system.diagonal[i]] * x[i]
+        h = x[i]
+        y[i] = h[0] * diagonal[3 * i] + h[1] * diagonal[3 * i + 1] + h[2] * diagonal[3 * i + 2]
     for i in range(x.shape[0]):
-        here, f = x[i] + wp.vec3d(), y[i] + wp.vec3d()
+        here, a, b, c = x[i] + wp.vec4d(), wp.vec4d(), wp.vec4d(), wp.vec4d()
         for m in range(system.above_start[i], system.above_start[i + 1]):
-            k = system.above[m]
-            j = system.col[k]
-            f += blocks[k] * x[j]
-            y[j] = y[j] + wp.transpose(blocks[k]) * here
+            j = system.col[system.above[m]]
+            there, r0, r1, r2 = x[j], rows[3 * m], rows[3 * m + 1], rows[3 * m + 2]
+            a += wp.cw_mul(r0, there)
+            b += wp.cw_mul(r1, there)
+            c += wp.cw_mul(r2, there)
+            y[j] = y[j] + (here[0] * r0 + here[1] * r1 + here[2] * r2)
+        f = y[i] + wp.vec4d(a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2], zero)
         y[i] = f
-        total += wp.dot(here, f)
+        total += wp.cw_mul(here, f)
+    result = total[0] + total[1] + total[2]
     for b in range(system.volume_motion.shape[1]):
-        s = wp.float64(0.0)
-        for k in range(system.block_pair_start[b], system.block_pair_start[b + 1]):
-            s += wp.dot(volume_row[k], x[system.pair_node[k]])
-        for k in range(system.block_pair_start[b], system.block_pair_start[b + 1]):
+        even, odd, end = wp.vec4d(), wp.vec4d(), system.block_pair_start[b + 1]
+        k = system.block_pair_start[b] + 0
+        while k + 1 < end:
+            even += wp.cw_mul(volume[k], x[system.pair_node[k]])
+            odd += wp.cw_mul(volume[k + 1], x[system.pair_node[k + 1]])
+            k += 2
+        if k < end:
+            even += wp.cw_mul(volume[k], x[system.pair_node[k]])
+        both = even + odd
+        s = both[0] + both[1] + both[2]
+        for k in range(system.block_pair_start[b], end):
             i = system.pair_node[k]
-            if system.free[i] != 0:
-                y[i] = y[i] + s * volume_row[k]
-        total += s * s
+            y[i] = y[i] + s * volume[k]
+        result += s * s
     for k in range(contacts.open_count[env]):
-        total += add_row(system, contacts, env, contacts.open_row[env, k], p, out)
-    return total
+        result += add_open_row(system, contacts, env, contacts.open_row[env, k], p, out)
+    return result

@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from ipc.arrays import FloatArray2d, IntArray, MatArray2d, VecArray2d
+from ipc.arrays import FloatArray2d, IntArray, MatArray2d, Vec4Array2d, VecArray2d
 from ipc.contact.contacts import Contacts, mat34d, rows_of
 from ipc.solver.frames import VertexMap
 
@@ -37,7 +37,8 @@ class SystemView:
     ``node_pair`` from ``node_pair_start[i]`` on. ``volume_motion`` (B, Q) is work space for q·p.
 
     For the products of :mod:`ipc.solver.halves`, and empty without them, ``above`` are the blocks above the diagonal between unknowns,
-    those of row i from ``above_start[i]`` on (N+1,).
+    those of row i from ``above_start[i]`` on (N+1,). ``half_rows`` (B, 3 U), ``half_diagonal`` (B, 3 N) are rows of these U blocks and of
+    those on the diagonal, with contact rows, ``half_volume`` (B, S) those of volume blocks; four numbers each, the last 0.
     """
 
     row_base: IntArray
@@ -59,6 +60,9 @@ class SystemView:
     volume_motion: FloatArray2d
     above_start: IntArray
     above: IntArray
+    half_rows: Vec4Array2d
+    half_diagonal: Vec4Array2d
+    half_volume: Vec4Array2d
 
 
 def slice_rows(row_start: NDArray[np.int32], width: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

@@ -62,6 +62,7 @@ class Newton:
         # A free ball rests on a point: only sums that mirror each other keep it there, and those by halves do not.
         if not self.device.is_cuda and self.pcg.is_in_one_block(self.preconditioner) and _is_held(layout):
             potential.use_halves()
+            self.preconditioner.use_lines(layout, potential.where)
         self._still = wp.zeros_like(potential.x)
         self._friction = int(potential.collision.friction)
         self._renewals, self._calm_renewals = (_RENEWALS, 0) if _is_held(layout) else (0, _CALM_RENEWALS)
@@ -219,6 +220,7 @@ class Newton:
         pot.aim()
         pot.aim_inertia(pot.R, pot.t)
         pot.measure_reach()
+        pot.forget_matrix()
 
     def _set_flags(self) -> None:
         self.state.clear_flags()

@@ -15,12 +15,13 @@ from typing import Any, TypeGuard
 import warp as wp
 
 from ipc.arrays import FloatArray2d, IntArray, VecArray2d
+from ipc.blocks import THREADS
 from ipc.contact.contacts import Contacts
 from ipc.reduce import BLOCK, chunks_of, raise_if_any, total_of
 from ipc.solver.block_jacobi import BlockJacobi
-from ipc.solver.blocks import THREADS
 from ipc.solver.linear import Preconditioner, SystemView, find_volume_motions, multiply_blocks, multiply_rows
 from ipc.solver.pcg_block import Scalars, solve_in_one_block
+from ipc.solver.pcg_serial import Vectors, make_vectors, solve_serially
 
 wp.set_module_options({"enable_backward": False})
 
@@ -144,6 +145,7 @@ class Pcg:
         self._by_rows = wp.zeros((batch, -(-lanes // BLOCK)), dtype=wp.float64, device=device)
         self._running = wp.zeros(batch, dtype=wp.int32, device=device)
         self._any = wp.zeros(1, dtype=wp.int32, device=device)
+        self._vectors = Vectors() if device.is_cuda else make_vectors(batch, nodes, device)
         self.scalars = Scalars()
         self.scalars.rz = wp.zeros((2, batch), dtype=wp.float64, device=device)
         self.scalars.rr0 = wp.zeros(batch, dtype=wp.float64, device=device)
@@ -176,7 +178,13 @@ class Pcg:
             max_iterations: after these the solution so far stands (it is a descent direction).
             active: mask (B,).
         """
-        if self.is_in_one_block(preconditioner):
+        if self.is_in_one_block(preconditioner) and preconditioner.lines is not None:
+            inputs = [
+                *(system, contacts, preconditioner.inverse, preconditioner.lines, preconditioner.elimination),
+                *(tolerance, max_iterations, active, self._vectors),
+            ]
+            wp.launch(solve_serially, dim=self.batch, inputs=inputs, outputs=[residual, x, self.scalars], device=self.device)
+        elif self.is_in_one_block(preconditioner):
             threads = THREADS if self.device.is_cuda else 1
             inputs = [
                 *(system, contacts, preconditioner.inverse, preconditioner.elimination, tolerance, max_iterations),

@@ -13,10 +13,9 @@ from __future__ import annotations
 import warp as wp
 
 from ipc.arrays import FloatArray, FloatArray2d, IntArray, MatArray2d, VecArray2d
+from ipc.blocks import block_sum, wait_for_block
 from ipc.contact.contacts import Contacts, rows_of
 from ipc.solver.affine_elimination import Elimination, finish_elimination
-from ipc.solver.blocks import block_sum, wait_for_block
-from ipc.solver.halves import multiply_half
 from ipc.solver.linear import SystemView, add_row, block_row, find_volume_motion
 
 wp.set_module_options({"enable_backward": False})
@@ -67,7 +66,6 @@ def solve_in_one_block(
     affines = affine.node.shape[0]
     volumes = system.volume_motion.shape[1]
     rows = rows_of(contacts, env)
-    halves = system.above_start.shape[0] > 0
     a = wp.float64(0.0)
     b = wp.float64(0.0)
     i = lane
@@ -91,29 +89,26 @@ def solve_in_one_block(
     wait_for_block()
     for it in range(max_iterations):
         a = wp.float64(0.0)
-        if halves:
-            a = multiply_half(system, contacts, env, p, Ap)
-        else:
-            if volumes > 0:
-                i = lane
-                while i < volumes:
-                    find_volume_motion(system, env, i, p)
-                    i += threads
-                wait_for_block()
+        if volumes > 0:
             i = lane
-            while i < n:
-                f = wp.vec3d()
-                if system.free[i] != 0:
-                    f = block_row(system, env, i, p)
-                    a += wp.dot(p[env, i], f)
-                Ap[env, i] = f
+            while i < volumes:
+                find_volume_motion(system, env, i, p)
                 i += threads
             wait_for_block()
-            i = lane
-            if lane < lanes:
-                while i < rows:
-                    a += add_row(system, contacts, env, i, p, Ap)
-                    i += lanes
+        i = lane
+        while i < n:
+            f = wp.vec3d()
+            if system.free[i] != 0:
+                f = block_row(system, env, i, p)
+                a += wp.dot(p[env, i], f)
+            Ap[env, i] = f
+            i += threads
+        wait_for_block()
+        i = lane
+        if lane < lanes:
+            while i < rows:
+                a += add_row(system, contacts, env, i, p, Ap)
+                i += lanes
         curvature = block_sum(a)
         if not (curvature > wp.float64(0.0)):
             if lane == 0:

@@ -18,8 +18,8 @@ from ipc.bodies.layout import Layout
 from ipc.contact.collision import Collision
 from ipc.reduce import BLOCK, MAX, MIN, SUM, Reducer
 from ipc.settings import Settings
-from ipc.solver import dilation, dynamics, elasticity, frames
-from ipc.solver.halves import fold_rows
+from ipc.solver import dilation, dynamics, elasticity, frames, reuse
+from ipc.solver.halves import copy_half, fold_rows
 from ipc.solver.linear import SystemView, find_volume_motions, push_blocks, push_rows, slice_rows, turn_rows
 
 _SLICE = 32
@@ -64,7 +64,8 @@ class Potential:
         self.reduce = Reducer(batch, max(nodes, verts, elements), device)
         self.reduce.prepare(nodes, verts, elements)
         self.elements = filled(elasticity.Elements, device, {name: getattr(layout, name) for name in elasticity.Elements.vars})
-        volumes = {name: getattr(layout, name) for name in dilation.VolumeBlocks.vars}
+        volumes = {name: getattr(layout, name) for name in dilation.VolumeBlocks.vars if name != "corner_place"}
+        volumes["corner_place"] = dilation.corner_places(layout)
         self.volumes = filled(dilation.VolumeBlocks, device, volumes)
         self.node_body, self.node_free = ints(layout.node_body), ints(layout.node_free)
         rows = np.repeat(np.arange(nodes, dtype=np.int64), np.diff(layout.row_start))
@@ -72,7 +73,9 @@ class Potential:
         self.dt = wp.full(batch, settings.dt, dtype=wp.float64, device=device)
         drag = np.zeros(len(layout.col))
         drag[diagonal] = layout.node_damping
-        pattern = {"row_start": layout.row_start, "col": layout.col, "mass": layout.mass}
+        massive = np.flatnonzero(layout.mass)
+        starts = np.concatenate([[0], np.cumsum(np.bincount(rows[massive], minlength=nodes))])
+        pattern = {"row_start": starts, "block": massive, "col": layout.col, "mass": layout.mass}
         inertia = layout.mass * (1.0 + layout.node_drive[rows])
         self.masses = filled(dynamics.Masses, device, {**pattern, "inertia": inertia, "drag": drag})
         self.drive = [floats(layout.node_drive), ints(layout.node_aim), wp.array(layout.aim_local, dtype=wp.vec3d, device=device)]
@@ -138,6 +141,8 @@ class Potential:
         self.system.R = self.R
         self.system.project = self.project
         self.mirrors = True
+        self._filled: Any = None
+        """Mask of :mod:`ipc.solver.reuse`."""
 
     def launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list | None = None) -> None:
         """Launch a kernel on the device of the batch."""
@@ -252,14 +257,30 @@ class Potential:
             ]
             self.launch(elasticity.block_hessian, dim, inputs, [blocks])
         else:
-            self.launch(elasticity.fill_inertia, dim, [self.upper, self.masses, self.dt, active], [blocks])
-            inputs = [self.places, self.elements, self.el_F, self.el_mckl, active]
-            self.launch(elasticity.add_element_blocks, self.el_J.shape, inputs, [blocks])
-            if self.mirrors:
-                self.launch(elasticity.mirror_blocks, dim, [self.upper, active], [blocks])
+            if self._filled is not None:
+                inputs = [self.el_F, self.project, active]
+                self.launch(reuse.choose_stale, self.batch, inputs, [self._filled_F, self._filled, self._stale])
+            self._fill_elements(active if self._filled is None else self._stale, blocks)
         if self.volume_blocks:
             inputs, row = [self.elements, self.volumes, self.el_F, active], self.system.volume_row
-            self.launch(dilation.dilation_rows, row.shape, inputs, [row])
+            if self.device.is_cuda:
+                self.launch(dilation.dilation_rows, row.shape, inputs, [row])
+            else:
+                inputs = [*inputs, self.system.block_pair_start]
+                self.launch(dilation.block_dilation_rows, self.dilation.shape, inputs, [row])
+
+    def _fill_elements(self, active: wp.array, blocks: wp.array) -> None:
+        dim = self.batch, len(self.upper)
+        self.launch(elasticity.fill_inertia, dim, [self.upper, self.masses, self.dt, active], [blocks])
+        inputs = [self.places, self.elements, self.el_F, self.el_mckl, active]
+        self.launch(elasticity.add_element_blocks, self.el_J.shape, inputs, [blocks])
+        if self.mirrors:
+            self.launch(elasticity.mirror_blocks, dim, [self.upper, active], [blocks])
+
+    def forget_matrix(self) -> None:
+        """Let the next :meth:`fill_matrix` compute all blocks."""
+        if self._filled is not None:
+            self._filled.fill_(reuse.NONE)
 
     def turn_rows(self, active: wp.array) -> None:
         """Write the contact rows of :meth:`touch` over the unknowns."""
@@ -279,6 +300,11 @@ class Potential:
         self.system.above, self.system.above_start = (
             wp.array(values, dtype=wp.int32, device=self.device) for values in (where[above], starts)
         )
+        system, pairs = self.system, self.system.volume_row.shape[1]
+        system.half_rows, system.half_diagonal, system.half_volume = (
+            wp.zeros((self.batch, size), dtype=wp.vec4d, device=self.device)
+            for size in (3 * len(above), 3 * len(layout.node_rest), pairs)
+        )
         # Gripped nodes push the unknowns with whole rows, and affine bodies are eliminated by whole blocks.
         self.mirrors = self.grips > 0 or bool((layout.vert_count > 1).any())
         if not self.mirrors:
@@ -286,10 +312,14 @@ class Potential:
             self.upper = wp.array(upper[unknown[upper[:, 0]]], dtype=wp.int32, device=self.device)
             places = _element_places(layout, rows, where, unknown)
             self.places = wp.array(places, dtype=wp.int32, device=self.device)
+            self._filled_F = wp.zeros_like(self.el_F)
+            self._filled, self._stale = (wp.full(self.batch, reuse.NONE, dtype=wp.int32, device=self.device) for _ in range(2))
 
     def fold_rows(self, active: wp.array) -> None:
-        """Add the rows of :meth:`turn_rows` to the blocks, if halves are used."""
+        """Copy half of the matrix and add the rows of :meth:`turn_rows`, if halves are used."""
         if self.system.above_start is not None:
+            size = max(len(self.system.free), self.system.half_volume.shape[1])
+            self.launch(copy_half, (self.batch, size), [self.system, active])
             self.launch(fold_rows, (self.batch,), [self.system, self.collision.contacts, active])
 
     def try_step(self, alpha: wp.array) -> None:
@@ -298,8 +328,11 @@ class Potential:
         self.place_vertices(self.y1, self.R, self.t, self.x1)
 
     def elastic_change(self, active: wp.array, min_det: wp.array) -> None:
-        """Elastic energy change from y to y1, and ``min_det`` (B,) ← min(min_det, det F at y1)."""
-        inputs, outputs = [self.y, self.y1, self.elements, active], [self.el_change, self.el_J1, self.el_dJ]
+        """Elastic energy change from y to y1, and ``min_det`` (B,) ← min(min_det, det F at y1).
+
+        After :meth:`evaluate_elements` at y.
+        """
+        inputs, outputs = [self.el_F, self.y1, self.elements, active], [self.el_change, self.el_J1, self.el_dJ]
         self.launch(elasticity.element_energy_change, self.el_change.shape, inputs, outputs)
         if self.volume_blocks:
             inputs = [self.elements, self.volumes, self.el_J1, self.el_dJ, active]

@@ -21,6 +21,7 @@ import numpy as np
 from raytac.calibrate.direct_light import ExtraLight, LedLight, Light, case_light, led_light
 from raytac.calibrate.imprint import PixelGeometry, pixel_geometry
 from raytac.calibrate.light_parameters import (
+    CLOSER,
     DARKEST,
     HEIGHT,
     LENGTH,
@@ -34,7 +35,9 @@ from raytac.calibrate.light_parameters import (
     least_mix,
     leds_inside,
     mean_power,
+    most_distorted,
     side_ties,
+    with_view,
 )
 from raytac.calibrate.photographs import Photographs, decode, encode, level_slope
 from raytac.optics.trace.quadrature import EdgePoints
@@ -53,11 +56,13 @@ SIGMA = {
     "vignette": 0.5,
     "mix": 0.1,
     "tone": 0.2,
+    "distance": 0.3,
+    "distortion": 0.03,
     "slope": 0.15,
 }
 """Standard deviation of a parameter about its start [mm, rad, 1].
 
-That of powers is over the mean power of the start."""
+That of powers is over the mean power of the start, that of the camera's distance over its start."""
 CIRCLE_SIGMA = np.array([1.0, 1.0, 1.5]) / 320
 """Standard deviation of a circle's x, y and radius about its label, over the image's width."""
 BORDER_SIGMA = 4.0
@@ -68,8 +73,16 @@ ACTIVE = 6
 """Most times that a step is solved for with more parameters at their bounds."""
 STEP = 1e-5
 """Step of the derivatives by response and imprint."""
+VIEW_STEPS = np.array([1e-2, 1e-5])
+"""Steps of the derivatives by the camera's distance [mm] and distortion."""
 REST_FACTOR = 8
 """The image at rest is fitted as means of so many pixels squared."""
+LEAST_SHARE = 0.1
+"""Least share of a channel's light at rest that a colour matrix leaves it (a guess).
+
+It may make light negative where no press was, and no gain of a sensor makes that bright. So fits are pushed back below this share."""
+LACK = 3000.0
+"""Residual [levels] of light that is a channel's mean below that."""
 
 
 @dataclass(frozen=True)
@@ -140,15 +153,14 @@ class DirectFit:
         self.rest_u, self.rest_v = rest_u.ravel(), rest_v.ravel()
         self.rest_real = coarse.background.reshape(-1, 3).astype(float)
         self.share = np.where(self.inside, 1.0, settings.ring_weight)[:, None]
-        self.rest_share = settings.rest_weight * np.sqrt(len(self.press) / len(self.rest_u))
+        self.lack_share = np.sqrt(len(self.press) / len(self.rest_u))
+        self.rest_share = settings.rest_weight * self.lack_share
         native, (cx, cy) = sensor.camera.resolution, sensor.camera.principal_point
         self.r2 = (((self.rest_u - cx) ** 2 + (self.rest_v - cy) ** 2) / (native[0] ** 2 + native[1] ** 2) * 4)[:, None]
         self.darkest = shots.background.reshape(-1, 3).min(0)[None]
         coat = sensor.coat
         diffuse = (1 - coat.specular) * np.array(coat.reflectance)
         self.even_gain = (diffuse + coat.specular) / diffuse
-        self.flat_geometry = self._geometry(start, self.u, self.v, np.full(len(self.u), -1))
-        self.rest_geometry = self._geometry(start, self.rest_u, self.rest_v, np.full(len(self.rest_u), -1))
         self.extra, self.shape = extra, (height, width)
         self.points = start.p.smooth_points
         wider = np.where(shots.fully_visible, 1.0, BORDER_SIGMA)[:, None]
@@ -193,16 +205,23 @@ class DirectFit:
         return stiff / self.sigma(state.p) ** 2
 
     def _geometry(self, state: FitState, u: np.ndarray, v: np.ndarray, press: np.ndarray) -> PixelGeometry:
-        return pixel_geometry(self.sensor, u, v, press, state.circles, self.shots.radius, state.slopes)
+        own = with_view(self.sensor, state.p)
+        return pixel_geometry(own, u, v, press, state.circles, self.shots.radius, state.slopes)
 
     def geometry(self, state: FitState) -> PixelGeometry:
         """Points and normals that the pixels of presses see."""
         return self._geometry(state, self.u, self.v, self.press)
 
-    def light(self, p: LightParameters, seen: PixelGeometry) -> Light:
-        """Light at what ``seen`` gives, at the same pixels at rest and over the image at rest."""
-        geometries = (seen, self.flat_geometry, self.rest_geometry)
-        return Light(*(self._led_layers(p, g, self._leds(p, g)) for g in geometries))
+    def geometries(self, state: FitState) -> tuple[PixelGeometry, PixelGeometry, PixelGeometry]:
+        """Points and normals in pixels of presses, the same at rest, and over the image at rest."""
+        places = (self.u, self.v, self.press), (self.u, self.v, np.full(len(self.u), -1))
+        at_rest = self.rest_u, self.rest_v, np.full(len(self.rest_u), -1)
+        seen, flat, rest = (self._geometry(state, *where) for where in (*places, at_rest))
+        return seen, flat, rest
+
+    def light(self, state: FitState) -> Light:
+        """Direct light of every LED at power 1."""
+        return Light(*(self._led_layers(state.p, g, self._leds(state.p, g)) for g in self.geometries(state)))
 
     def _leds(self, p: LightParameters, seen: PixelGeometry) -> list[LedLight]:
         return [led_light(seen, led, points, REFERENCE_DISTANCE) for led, points in zip(p.leds, self.points, strict=True)]
@@ -232,15 +251,21 @@ class DirectFit:
         linear = (decode(self.behind, gamma, p.curve) - black) * pressed / flat + black
         return linear, rest * (1 + self.r2 * (a1 + a2 * self.r2)) + black, black
 
+    def lack(self, p: LightParameters, total: list[np.ndarray]) -> np.ndarray:
+        """Light at rest that is below the least share, over its channel's mean, (K, 3) [levels]."""
+        unmixed = total[2] @ np.linalg.inv(p.mixing).T
+        return LACK * np.minimum(total[2] - LEAST_SHARE * unmixed, 0) / np.maximum(unmixed.mean(0), _LEAST)
+
     def blocks(self, p: LightParameters) -> list[tuple[str, int]]:
         """Name (of ``SIGMA``) of every parameter of the vector's blocks, and how many follow."""
         per_led = [("place", 3), ("aim", 2), ("lobe", 1), ("height", 1), ("length", 1)] * len(p.leds)
         rest = [("glow", 3), ("gamma", 1), ("stray", 3), ("vignette", 2), ("mix", 6), ("tone", len(MOST_BENT))]
-        return [*per_led, ("power", p.power.size), *rest, ("slope", len(self.start.slopes))]
+        view = [("distance", 1), ("distortion", 1)]
+        return [*per_led, ("power", p.power.size), *rest, *view, ("slope", len(self.start.slopes))]
 
     def sigma(self, p: LightParameters) -> np.ndarray:
         """Standard deviation of every parameter about its start, (n,)."""
-        unit = {"power": mean_power(self.start.p)}
+        unit = {"power": mean_power(self.start.p), "distance": self.start.p.view[0]}
         return np.concatenate([np.full(n, SIGMA[name] * unit.get(name, 1.0)) for name, n in self.blocks(p)])
 
     def free(self, p: LightParameters) -> np.ndarray:
@@ -262,14 +287,14 @@ class DirectFit:
 
     def flat(self, state: FitState) -> np.ndarray:
         p = state.p
-        return np.concatenate([p.leds.ravel(), p.power.ravel(), p.glow, p.response, p.mix, p.tone, state.slopes])
+        return np.concatenate([p.leds.ravel(), p.power.ravel(), p.glow, p.response, p.mix, p.tone, p.view, state.slopes])
 
     def at(self, x: np.ndarray, circles: np.ndarray) -> FitState:
         p = self.start.p
-        cuts = np.cumsum([p.leds.size, p.power.size, 3, 6, 6, len(MOST_BENT)])
-        leds, power, glow, response, mix, tone, slopes = np.split(x, cuts)
+        cuts = np.cumsum([p.leds.size, p.power.size, 3, 6, 6, len(MOST_BENT), 2])
+        leds, power, glow, response, mix, tone, view, slopes = np.split(x, cuts)
         leds, power = leds.reshape(p.leds.shape), power.reshape(-1, 3)
-        changed = dataclasses.replace(p, leds=leds, power=power, glow=glow, response=response, mix=mix, tone=tone)
+        changed = LightParameters(p.template, leds, power, glow, response, mix, tone, view)
         return FitState(changed, slopes, circles)
 
     def inside_bounds(self, state: FitState) -> FitState:
@@ -289,15 +314,24 @@ class DirectFit:
         response[5:] = bounded("vignette", response[5:], max(-0.3, -0.75 - response[4]), 1.5)
         power, glow = bounded("power", p.power, 0, None), bounded("glow", p.glow, 0, None)
         mix, tone = bounded("mix", p.mix, least_mix(self.sensor), 0), bounded("tone", p.tone, -MOST_BENT, MOST_BENT)
-        changed = dataclasses.replace(p, leds=leds, power=power, glow=glow, response=response, mix=mix, tone=tone)
+        distance = bounded("distance", p.view[:1], *(c * self.start.p.view[0] for c in CLOSER))
+        most = most_distorted(self.sensor, dataclasses.replace(p, view=np.append(distance, 0.0)))
+        view = np.append(distance, bounded("distortion", p.view[1:], -most, most))
+        changed = LightParameters(p.template, leds, power, glow, response, mix, tone, view)
         circles = state.circles.copy()
         circles[:, 2] = np.clip(circles[:, 2], 3, None)
         return FitState(changed, state.slopes, circles)
 
     def residuals(self, state: FitState) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals [levels] of pressed pixels (M, 3) and the image at rest (K, 3), not weighted."""
-        image, rest = self.images(state.p, self.total(state.p, self.light(state.p, self.geometry(state))))
-        return image - self.real, rest - self.rest_real
+        """Residuals [levels], not weighted: of pressed pixels (M, 3), and (2, K, 3) at rest.
+
+        Those at rest are of the image and of its ``lack``.
+        """
+        return self._residuals(state.p, self.total(state.p, self.light(state)))
+
+    def _residuals(self, p: LightParameters, total: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        image, rest = self.images(p, total)
+        return image - self.real, np.stack([rest - self.rest_real, self.lack(p, total)])
 
     def weights(self, off: np.ndarray, limit: float) -> np.ndarray:
         """Huber's weights of residuals: 1 up to ``limit``, then falling."""
@@ -305,10 +339,11 @@ class DirectFit:
 
     def cost(self, state: FitState, off: tuple[np.ndarray, np.ndarray]) -> float:
         h = self.settings.huber
-        robust = [np.where(np.abs(r) <= h, r * r, h * (2 * np.abs(r) - h)) for r in off]
+        robust = [np.where(np.abs(r) <= h, r * r, h * (2 * np.abs(r) - h)) for r in (off[0], off[1][0])]
         x = (self.flat(state) - self.flat(self.start)) / self.sigma(state.p)
         c, tied = (state.circles - self.shots.circles) / self.circle_sigma, self.ties.off(self.flat(state))
         images = (robust[0] * self.share**2).sum() + (robust[1] * self.rest_share**2).sum()
+        images += ((off[1][1] * self.lack_share) ** 2).sum()
         away = self.flat(state) - self.anchor
         priors = (
             self.settings.prior * (x @ x)
@@ -319,25 +354,29 @@ class DirectFit:
         return float(images + priors)
 
     def jacobian(self, state: FitState) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        """Jacobians of presses (3M, G), rest (3K, G) and presses by circles (3M, 3); both images."""
-        p, seen = state.p, self.geometry(state)
-        geometries = (seen, self.flat_geometry, self.rest_geometry)
+        """Jacobians of ``residuals`` (3M, G) and (6K, G), of presses by circles (3M, 3); residuals."""
+        p, geometries = state.p, self.geometries(state)
         leds = [self._leds(p, g) for g in geometries]
         whole = self._with_extra(p, Light(*(self._led_layers(p, g, part) for g, part in zip(geometries, leds, strict=True))))
         total = _summed(p, whole)
-        image, rest = self.images(p, total)
+        off, rest_off = self._residuals(p, total)
         gains = self._gains(p, total)
         (count, wide), slopes = p.leds.shape, len(state.slopes)
         first = p.leds.size + p.power.size
         mixing, unmixed = p.mixing.T, [_powered(p, part) for part in whole.parts]
-        last = first + 15 + len(p.tone)
-        jac = np.zeros((last + slopes, image.size), np.float32)
-        rest_jac = np.zeros((len(jac), rest.size), np.float32)
+        last = first + 17 + len(p.tone)
+        jac = np.zeros((last + slopes, off.size), np.float32)
+        rest_jac = np.zeros((len(jac), rest_off.size), np.float32)
 
-        def column(k: int, *parts: np.ndarray, mixing: np.ndarray = mixing) -> None:
+        lack = rest_off[1]
+        mean = np.maximum((total[2] @ np.linalg.inv(p.mixing).T).mean(0), _LEAST)
+
+        def column(k: int, *parts: np.ndarray, mixing: np.ndarray = mixing, of_matrix: bool = False) -> None:
             pressed, flat, still = (part @ mixing for part in parts)
             jac[k] = (gains[0] * pressed - gains[1] * flat).ravel()
-            rest_jac[k] = (gains[2] * still).ravel()
+            unmixed = np.zeros_like(still) if of_matrix else np.broadcast_to(parts[2], still.shape)
+            lacking = (LACK * (lack < 0) * (still - LEAST_SHARE * unmixed) - lack * unmixed.mean(0)) / mean
+            rest_jac[k] = np.stack([gains[2] * still, lacking]).ravel()
 
         none, by_led = (np.zeros((1, 3)),) * 3, {} if self.extra is None else self.extra.by_led
         for led in range(count):
@@ -354,28 +393,36 @@ class DirectFit:
         for begin, name in ((first + 3, "response"), (first + 15, "tone")):
             values = getattr(p, name)
             for k, step in enumerate(STEP * np.eye(len(values)), begin):
-                other, other_rest = self.images(dataclasses.replace(p, **{name: values + step}), total)
-                jac[k], rest_jac[k] = ((other - image) / STEP).ravel(), ((other_rest - rest) / STEP).ravel()
+                changed = dataclasses.replace(p, **{name: values + step})
+                other, other_rest = self._residuals(changed, total)
+                jac[k], rest_jac[k] = ((other - off) / STEP).ravel(), ((other_rest - rest_off) / STEP).ravel()
         for k, (row, other) in enumerate(np.argwhere(OFF_DIAGONAL)):
-            column(first + 9 + k, *unmixed, mixing=np.outer(np.eye(3)[other], np.eye(3)[row]))
-        by_point, by_normal = (part @ mixing for part in self._by_geometry(p, leds[0]))
+            column(first + 9 + k, *unmixed, mixing=np.outer(np.eye(3)[other], np.eye(3)[row]), of_matrix=True)
+        by_geometry = [self._by_geometry(p, part) for part in leds]
+
+        def change(part: int, new: PixelGeometry) -> np.ndarray:
+            (by_point, by_normal), old = by_geometry[part], geometries[part]
+            return np.einsum("kmc,km->mc", by_point, new.p - old.p) + np.einsum("kmc,km->mc", by_normal, new.n - old.n)
 
         def moved(slopes: np.ndarray, circles: np.ndarray, step: float) -> np.ndarray:
             new = self.geometry(FitState(p, slopes, circles))
-            change = np.einsum("kmc,km->mc", by_point, new.p - seen.p) + np.einsum("kmc,km->mc", by_normal, new.n - seen.n)
-            return (gains[0] * change / step).ravel()
+            return (gains[0] * (change(0, new) @ mixing) / step).ravel()
+
+        for k, step in enumerate(VIEW_STEPS * np.eye(2)):
+            new = self.geometries(dataclasses.replace(state, p=dataclasses.replace(p, view=p.view + step)))
+            column(last - 2 + k, *(change(part, g) / step[k] for part, g in enumerate(new)))
 
         for k in range(slopes):
             jac[last + k] = moved(state.slopes + STEP * np.eye(slopes)[k], state.circles, STEP)
-        circles = np.zeros((image.size, 3), np.float32)
+        circles = np.zeros((off.size, 3), np.float32)
         if self.settings.circles:
             for k in range(3):
                 circles[:, k] = moved(state.slopes, state.circles + 1e-3 * np.eye(3)[k], 1e-3)
-        return jac.T, rest_jac.T, circles, (image, rest)
+        return jac.T, rest_jac.T, circles, (off, rest_off)
 
     def _by_geometry(self, p: LightParameters, leds: list[LedLight]) -> tuple[np.ndarray, np.ndarray]:
-        """Slopes (3, M, 3) of the presses' linear light by a pixel's point [1/m] and normal."""
-        by_point, by_normal = np.zeros((2, 3, len(self.press), 3))
+        """Slopes (3, M, 3) of the linear light of M pixels by their point [1/m] and normal."""
+        by_point, by_normal = np.zeros((2, 3, len(leds[0].light), 3))
         for led, power, layer in zip(leds, p.power, p.layer, strict=True):
             by_point -= 1e3 * led.by_led[:3, :, None] * power
             by_normal += led.by_normal[:, :, None] * power
@@ -391,10 +438,10 @@ class DirectFit:
     def step(self, state: FitState) -> Callable[[float], FitState]:
         """The normal equations at ``state``; the result gives the trial state of any damping."""
         settings, count = self.settings, len(self.shots.circles)
-        jac, rest_jac, circles, (image, rest) = self.jacobian(state)
-        off, rest_off = image - self.real, rest - self.rest_real
+        jac, rest_jac, circles, (off, rest_off) = self.jacobian(state)
         w = (self.weights(off, settings.huber) * self.share**2).ravel().astype(np.float32)
-        rest_w = (self.weights(rest_off, settings.huber) * self.rest_share**2).ravel().astype(np.float32)
+        seen = self.weights(rest_off[0], settings.huber) * self.rest_share**2
+        rest_w = np.stack([seen, np.full_like(seen, self.lack_share**2)]).ravel().astype(np.float32)
         free = self.free(state.p)
         x, x0, sigma = self.flat(state), self.flat(self.start), self.sigma(state.p)
         size = len(x)
@@ -485,6 +532,10 @@ class DirectFit:
         return state
 
 
+_LEAST = 1e-6
+"""Least light [full scales] of presses that is divided by."""
+
+
 def _draw(rho: np.ndarray, settings: FitSettings, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Press, row and column of the pixels that count; ``rho`` (N, H, W): distances over radii."""
     rng, results = np.random.default_rng(seed), []
@@ -498,8 +549,12 @@ def _draw(rho: np.ndarray, settings: FitSettings, seed: int) -> tuple[np.ndarray
 
 
 def _summed(p: LightParameters, light: Light) -> list[np.ndarray]:
-    """All LEDs at their powers, mixed by the colour matrix, (M, 3) of each part of ``light``."""
-    return [np.maximum(_powered(p, part) @ p.mixing.T, 1e-6) for part in light.parts]
+    """All LEDs at their powers, mixed by the colour matrix, (M, 3) of each part of ``light``.
+
+    Of presses it is > 0. At rest it may be negative, and counts as a ``lack`` then.
+    """
+    pressed, flat, rest = (_powered(p, part) @ p.mixing.T for part in light.parts)
+    return [np.maximum(pressed, _LEAST), np.maximum(flat, _LEAST), rest]
 
 
 def _powered(p: LightParameters, part: np.ndarray) -> np.ndarray:

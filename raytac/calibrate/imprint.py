@@ -17,7 +17,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid, rest_height
-from raytac.specs.sensor import SensorSpec
+from raytac.specs.sensor import CameraSpec, SensorSpec
 
 KNOTS = np.array([0.0, 0.3, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5, 1.75, 2.0, 2.4, 3.0])
 """Distances over the contact radius between which the slope is linear; 0 at both ends."""
@@ -52,22 +52,37 @@ def _heights(slopes: np.ndarray, share: np.ndarray) -> np.ndarray:
     return total[:, -1:] - total
 
 
+def _on_plane(camera: CameraSpec, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x and y [m], from the pinhole's, where pixels see the plane z = 0."""
+    (cx, cy), (fx, fy) = camera.principal_point, camera.focal
+    tx, ty = camera.lens.slope((u - cx) / fx, (v - cy) / fy)
+    return -camera.position[2] * tx, -camera.position[2] * ty
+
+
+def _pitch(camera: CameraSpec, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Side [m] of a square on the plane z = 0 as large as what a pixel shows of it."""
+    ends = [_on_plane(camera, u + 0.5 * du, v + 0.5 * dv) for du, dv in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    (a, b), (c, d) = ([e - f for e, f in zip(ends[k], ends[k + 1], strict=True)] for k in (0, 2))
+    return np.sqrt(a * d - b * c)
+
+
 def circles_on_pad(sensor: SensorSpec, circles: np.ndarray, ball_radius: np.ndarray) -> np.ndarray:
     """x, y and radius [m] in the pad frame of circles (N, 3) [px of the sensor's resolution].
 
     A circle in the image is that of the rim, which lies about a² / 2R nearer to the camera than the pad at rest.
     """
     camera = sensor.camera
-    (cx, cy), (px, py), distance = camera.principal_point, camera.pixel_pitch, -camera.position[2]
+    distance = -camera.position[2]
     u, v, r = np.asarray(circles, dtype=float).T
-    deep = 0.5 * (r * px) ** 2 / ball_radius
+    (flat_x, flat_y), flat_r = _on_plane(camera, u, v), r * _pitch(camera, u, v)
+    deep = 0.5 * flat_r**2 / ball_radius
     z = -deep
     x, y = z, z
     for _ in range(5):  # the pixel's ray meets the dome, moved by that depth
-        x = camera.position[0] + (u - cx) * px * (1 + z / distance)
-        y = camera.position[1] + (v - cy) * py * (1 + z / distance)
+        x = camera.position[0] + flat_x * (1 + z / distance)
+        y = camera.position[1] + flat_y * (1 + z / distance)
         z = -sensor.gelpad.sag(x, y) - deep
-    return np.stack([x, y, r * px * (1 + z / distance)], axis=1)
+    return np.stack([x, y, flat_r * (1 + z / distance)], axis=1)
 
 
 def rims_on_pad(sensor: SensorSpec, circles: np.ndarray, ball_radius: np.ndarray) -> np.ndarray:
@@ -97,8 +112,7 @@ def pixel_geometry(
     that six steps leave less than a micrometre.
     """
     camera = sensor.camera
-    (cx, cy), (px, py), distance = camera.principal_point, camera.pixel_pitch, -camera.position[2]
-    flat_x, flat_y = (u - cx) * px, (v - cy) * py
+    distance, (flat_x, flat_y) = -camera.position[2], _on_plane(camera, u, v)
     pressed = press >= 0
     on_pad = circles_on_pad(sensor, circles, ball_radius) if len(circles) else np.array([[0.0, 0.0, 1.0]])
     share = on_pad[:, 2] / ball_radius if len(circles) else np.zeros(1)

@@ -1,4 +1,4 @@
-"""Parameters of a fit of lights: LEDs and their bounds, glow, response, ties.
+"""Parameters of a fit of lights: LEDs and their bounds, glow, response, view, ties.
 
 An LED has place, aim, lobe, height, length and power. A press says something only about the light that reaches it, so LEDs far from all
 presses are poorly known. Ties carry over from those nearby: LEDs of one side are of one kind, and stand mirrored about the middle of
@@ -17,6 +17,7 @@ from raytac.calibrate.photographs import decode
 from raytac.errors import InputError
 from raytac.optics.trace.quadrature import EdgePoints, quadrature
 from raytac.specs import LedSpec, LightsSpec, SensorSpec
+from raytac.specs.sensor import CameraSpec
 from raytac.specs.sensor_check import view_edges
 from raytac.specs.tone import STRAIGHT, ToneCurve
 
@@ -44,6 +45,10 @@ ROUNDED = 1e-3
 """Most that a matrix may begin beyond these bounds: that of a file is rounded."""
 MOST_BENT = np.array([0.4, 0.1, 0.4])
 """Most of the size of a fitted tone curve's coefficients: with them every curve rises."""
+CLOSER = 0.6, 2.5
+"""Range of a fitted distance from pinhole to pad, over that of the start (a guess)."""
+MOST_DISTORTED, MOST_K1 = 0.1, 1.9
+"""Most of the size of a fitted distortion (a guess), and of its k1."""
 OFF_DIAGONAL = ~np.eye(3, dtype=bool)
 REFERENCE_DISTANCE = 10e-3
 """Distance [m] at which a power of 1 gives a coat facing the LED full scale."""
@@ -68,6 +73,9 @@ class LightParameters:
     """(6,): the colour matrix off its diagonal, row by row, for light in full scales."""
     tone: np.ndarray
     """(3,): coefficients of the tone curve."""
+    view: np.ndarray
+    """(2,): distance of the pinhole from z = 0 [mm], and radial distortion k1 r² half an image
+    from the middle along its longer side."""
 
     @classmethod
     def of(cls, sensor: SensorSpec, background: np.ndarray) -> LightParameters:
@@ -94,7 +102,9 @@ class LightParameters:
         glow = [max((led.glow for led in sensor.lights.leds if led.layer == c), default=0.0) * _GLOW for c in CHANNELS]
         a1, a2, _ = response.vignetting
         at_response, mix = np.array([response.gamma, *stray, a1, a2]), np.array(response.colour_mix) * _mixed_balance(sensor)
-        return cls(sensor.lights, np.array(leds), np.array(power), np.array(glow), at_response, mix, tone)
+        camera = sensor.camera
+        view = np.array([-1e3 * camera.position[2], camera.distortion[0] * _half_view(camera) ** 2])
+        return cls(sensor.lights, np.array(leds), np.array(power), np.array(glow), at_response, mix, tone, view)
 
     @property
     def mixing(self) -> np.ndarray:
@@ -193,6 +203,25 @@ def check_tone(p: LightParameters) -> None:
         raise InputError("response.tone", value=tuple(float(f"{t:.4g}") for t in p.tone), rule=rule)
 
 
+def _half_view(camera: CameraSpec) -> float:
+    """Slope that half the image's longer side is in units of the focal length."""
+    return 0.5 * max(n / f for n, f in zip(camera.resolution, camera.focal, strict=True))
+
+
+def most_distorted(sensor: SensorSpec, p: LightParameters) -> float:
+    """Most of the size of a fitted distortion at the fitted distance."""
+    half = _half_view(sensor.camera) * -1e3 * sensor.camera.position[2] / float(p.view[0])
+    return min(MOST_DISTORTED, MOST_K1 * half**2)
+
+
+def with_view(sensor: SensorSpec, p: LightParameters) -> SensorSpec:
+    """The sensor whose camera has the fitted view: the same pixel pitch at another distance."""
+    camera, (distance, distortion) = sensor.camera, map(float, p.view)
+    moved = dataclasses.replace(camera, position=(*camera.position[:2], -1e-3 * distance))
+    k1 = distortion / _half_view(moved) ** 2
+    return dataclasses.replace(sensor, camera=dataclasses.replace(moved, distortion=(k1, *camera.distortion[1:])))
+
+
 def mean_power(p: LightParameters) -> float:
     """Mean over LEDs of their power in the channel that they light most [full scales]."""
     return max(float(p.power.max(1).mean()), 1e-6)
@@ -213,7 +242,7 @@ def with_parameters(sensor: SensorSpec, p: LightParameters, background: np.ndarr
         colour_mix=mix,
         tone=tuple(map(float, p.tone)) if p.tone.any() else (),
     )
-    return dataclasses.replace(sensor, response=response, lights=p.lights(sensor))
+    return dataclasses.replace(with_view(sensor, p), response=response, lights=p.lights(sensor))
 
 
 def darkest(background: np.ndarray, gamma: float, curve: ToneCurve = STRAIGHT) -> np.ndarray:

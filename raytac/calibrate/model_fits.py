@@ -41,6 +41,8 @@ GRID_PITCH = 0.06e-3
 class Models:
     """Fits to one set of presses: the lights with imprint and circles, and a mode of each kind."""
 
+    given: SensorSpec
+    """The sensor before the fit."""
     fitted: Fitted
     settled: Settled
     """The fitted photographs with the image at rest of all modes, without session drift."""
@@ -57,6 +59,10 @@ class Models:
     def rest(self) -> np.ndarray:
         """The image at rest of all modes [levels], (H, W, 3)."""
         return self.settled.shots.background
+
+    def sensor_of(self, mode: str) -> SensorSpec:
+        """The sensor that a mode was built for: the ray tracer alone has the fitted camera."""
+        return self.fitted.sensor if mode in ("raytrace", ALONE) else self.given
 
     def drift(self, shots: Photographs) -> Drift:
         """Session drift of presses that were not fitted, from their pixels far from a contact."""
@@ -161,7 +167,7 @@ def fit_models(
             built[name] = Mlp(fit_mlp(sensor, background, samples, seed=seed)).build(sensor, device=device)
         else:
             built[name] = Phong(background=background.astype(np.uint8)).build(sensor, device=device)
-    return Models(fitted, steady, drift, prior, built, device, tracing)
+    return Models(sensor, fitted, steady, drift, prior, built, device, tracing)
 
 
 def images_of(mode: OpticalMode, sensor: SensorSpec, shots: Photographs, circles: np.ndarray, slopes: np.ndarray) -> np.ndarray:
@@ -175,12 +181,12 @@ def images_of(mode: OpticalMode, sensor: SensorSpec, shots: Photographs, circles
     return np.array(images)
 
 
-def mode_times(models: Models, sensor: SensorSpec, shots: Photographs, circles: np.ndarray, repeats: int = 9) -> dict[str, float]:
+def mode_times(models: Models, shots: Photographs, circles: np.ndarray, repeats: int = 9) -> dict[str, float]:
     """Median time [ms] of every mode for one image, everything compiled, the image on the host."""
-    grid = make_grid(sensor.gelpad, GRID_PITCH)
-    surface = press_surface(sensor, grid, circles[:1], shots.radius[:1], models.fitted.state.slopes)
+    grid = make_grid(models.given.gelpad, GRID_PITCH)
     times = {}
     for name, mode in models.modes.items():
+        surface = press_surface(models.sensor_of(name), grid, circles[:1], shots.radius[:1], models.fitted.state.slopes)
         taken = []
         for _ in range(repeats + 2):
             began = time.perf_counter()

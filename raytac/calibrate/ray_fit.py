@@ -17,7 +17,7 @@ import numpy as np
 from raytac.calibrate.direct_fit import REST_FACTOR, SIGMA, DirectFit, FitSettings, FitState
 from raytac.calibrate.direct_light import ExtraLight, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
-from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LENGTH, SHORTEST, LightParameters, with_parameters
+from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LENGTH, SHORTEST, LightParameters, with_parameters, with_view
 from raytac.calibrate.photographs import Photographs, decode
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid, make_grid
@@ -64,7 +64,7 @@ class Fitted:
 
 def brightened(problem: DirectFit, state: FitState) -> FitState:
     """The same with powers that give the image at rest its mean in every channel."""
-    rest = problem.total(state.p, problem.light(state.p, problem.geometry(state)))[2].mean(0)
+    rest = problem.total(state.p, problem.light(state))[2].mean(0)
     gain = decode(problem.rest_real, state.p.response[0], state.p.curve).mean(0) / np.maximum(rest, 1e-9)
     return dataclasses.replace(state, p=dataclasses.replace(state.p, power=state.p.power * gain))
 
@@ -77,7 +77,7 @@ def first_state(sensor: SensorSpec, shots: Photographs, settings: FitSettings, s
 
 def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, tracing: RayTraced) -> Light:
     """Light of LEDs at power 1 that the ray tracer adds to direct light, at the fit's pixels."""
-    sensor, p = problem.sensor, state.p
+    sensor, p = with_view(problem.sensor, state.p), state.p
     unit = dataclasses.replace(p, power=np.ones_like(p.power))
     lit = dataclasses.replace(sensor, lights=unit.lights(sensor))
     height, width = problem.shape
@@ -98,7 +98,7 @@ def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, trac
     still = layers(GelSurface.at_rest(grid))[:, 0]
     by = REST_FACTOR * height // problem.shots.background.shape[0]
     rest = still.reshape(len(still), height // by, by, width // by, by, 3).mean((2, 4)).reshape(len(still), -1, 3)
-    return Light(pressed, still[:, problem.row, problem.column], rest).plus(problem.light(p, problem.geometry(state)), -1.0)
+    return Light(pressed, still[:, problem.row, problem.column], rest).plus(problem.light(state), -1.0)
 
 
 def extra_light(
@@ -148,14 +148,14 @@ def fit_lights(
     ``start``: where the fit begins; None is ``first_state``. ``rounds`` of defect correction follow the fit of direct light; 0 leaves it
     at that. Direct light is fitted from ``starts`` places, the given one and others about it, and the best goes on. ``seed`` chooses
     pixels and places. ``tick`` is called with the stage and the cost after every step. Raises InputError: refraction, a camera with
-    distortion, tilt or without colours, LEDs of no colour, a colour matrix outside its bounds that is not fixed, or fewer values than
+    tilt or without colours, LEDs of no colour, a colour matrix outside its bounds that is not fixed, or fewer values than
     parameters; BackendError: the ray tracer cannot run on ``device``.
     """
     settings = FitSettings() if settings is None else settings
     if sensor.refraction.model != "none":
         raise InputError("refraction.model", value=sensor.refraction.model, rule="cannot be fitted", choices=("none",))
-    if not sensor.camera.lens.is_plain or sensor.camera.monochrome:
-        rule = "must have no distortion, tilt or monochrome camera: fits know a pinhole of three colours that looks along +z"
+    if sensor.camera.lens.tilts or sensor.camera.monochrome:
+        rule = "must have no tilt or monochrome camera: fits know a camera of three colours that looks along +z"
         raise InputError("sensor.camera", value=sensor.name, rule=rule)
     begin = start or first_state(sensor, shots, settings, seed)
     problem = DirectFit(sensor, shots, begin, settings, factor=FACTOR, seed=seed)

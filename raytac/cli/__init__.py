@@ -15,7 +15,8 @@ from types import NoneType
 from typing import Any, get_args
 
 from raytac import __version__
-from raytac.errors import InputError, RaytacError
+from raytac.device import library_missing
+from raytac.errors import BackendError, InputError, RaytacError
 from raytac.io.folder import DISK_ERRORS
 from raytac.io.progress import Progress
 
@@ -98,11 +99,20 @@ def _run(args: Sequence[str]) -> int:
 
     registry = ConstructorRegistry()
     registry.primitive_rule(_optional)
-    module = importlib.import_module(f"raytac.cli.{args[0].replace('-', '_')}")
+    module = _module_of(args[0])
     command = getattr(module, COMMANDS[args[0]][0])
     with registry:
         parsed = tyro.cli(command, prog=f"raytac {args[0]}", args=args[1:])
     return parsed.run()
+
+
+def _module_of(command: str) -> Any:
+    try:
+        return importlib.import_module(f"raytac.cli.{command.replace('-', '_')}")
+    except (ImportError, NameError) as error:  # Dr.Jit 1.5 hides the first behind the second
+        if missing := library_missing():
+            raise BackendError(missing) from error
+        raise
 
 
 def _optional(option: Any) -> Any:

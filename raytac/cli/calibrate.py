@@ -69,7 +69,7 @@ class CalibrateArgs(FitOptions, SolverOptions):
     def run(self) -> int:
         start = time.perf_counter()
         self._refuse_options_of_others()
-        self.prepare_warp()
+        self.prepare_warp(soft=self._kind != "a data set")
         if self._kind == "a data set":
             return self._optics(start)
         if self._kind == "a table of forces":

@@ -60,7 +60,7 @@ class CompareArgs(SolverOptions):
         out = self.folder("compare")
         settings = self.settings()
         settings.check()
-        self.prepare_warp()
+        self.prepare_warp(soft=settings.markers)
         with kept_if_interrupted(f"rows that are finished are kept in {out}"):
             so_far = partial(self._write, out=out, start=start)
             written = so_far(run_comparison(settings, out, report=so_far))

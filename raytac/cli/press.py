@@ -19,7 +19,7 @@ from raytac.io.metrics import Metric, read_metrics
 from raytac.io.options import parse_outputs, parse_resolution
 from raytac.markers import MARKERS
 from raytac.optics import INTEGRATORS, OPTICS, OpticalMode, OpticsConfig
-from raytac.physics import PHYSICS
+from raytac.physics import PHYSICS, Ipc
 from raytac.report.press import run_press
 from raytac.sensor import TactileSensor, sensor_outputs
 from raytac.specs import PADS, press_of
@@ -111,7 +111,7 @@ class PressArgs(ShadowOptions, SolverOptions):
             repair=self.repair,
         )
         physics = chosen_physics(self.physics, self.level, scene)
-        self.prepare_warp()
+        self.prepare_warp(soft=isinstance(physics, Ipc))
         sensor = TactileSensor(
             self.sensor,
             physics=physics,

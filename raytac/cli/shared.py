@@ -60,10 +60,10 @@ class SolverOptions(CommonOptions):
     verbose: bool = False
     """Let Warp, in which contacts are computed, list devices and the kernels that it loads."""
 
-    def prepare_warp(self) -> None:
-        """Call before contacts are first computed."""
+    def prepare_warp(self, *, soft: bool = False) -> None:
+        """Call before contacts are first computed; ``soft``: pads are soft ones."""
         quiet_warp(not self.verbose)
-        if not self.verbose and not has_compiled_kernels():
+        if not self.verbose and not has_compiled_kernels(solver=soft):
             logging.getLogger("raytac").info("compiling kernels: up to a minute, once on a machine")
 
 

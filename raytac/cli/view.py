@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+import raytac
 from raytac.checks import check_known, check_whole
 from raytac.cli.shared import ShadowOptions, chosen_physics, named
 from raytac.errors import InputError
@@ -202,9 +202,9 @@ def _fitting(resolution: tuple[int, int]) -> tuple[int, int]:
 
 
 def _shipped_policy(name: str) -> Path | None:
-    """File of a shipped policy; None for another name, or without the extra ``envs``."""
-    if importlib.util.find_spec("gymnasium") is None:
-        return None
+    """File of a shipped policy; None for another name. ``BackendError`` without ``envs``."""
+    if name not in {path.stem for path in (Path(raytac.__file__).parent / "learn" / "policies").glob("*.pt")}:
+        return None  # before the import, which needs Gymnasium
     from raytac.learn.policies import shipped_policies
 
     return shipped_policies().get(name)

@@ -73,8 +73,12 @@ class Products:
     def span(self, count: int) -> wp.array:
         """The whole of ``count`` rows or columns, for every environment."""
         if count not in self._spans:
-            self._spans[count] = wp.array(np.tile([0, count], (self.num_envs, 1)), dtype=wp.vec2i, device=self.device)
+            self._spans[count] = self.part(0, count)
         return self._spans[count]
+
+    def part(self, first: int, end: int) -> wp.array:
+        """Rows or columns from ``first`` to before ``end``, for every environment."""
+        return wp.array(np.tile([first, end], (self.num_envs, 1)), dtype=wp.vec2i, device=self.device)
 
     def multiply(
         self,

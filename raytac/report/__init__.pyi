@@ -13,7 +13,9 @@ from .measure import once as once
 from .measure import timed as timed
 from .measure import timed_within as timed_within
 from .measure import wilson_interval as wilson_interval
+from .pads import ModeImage as ModeImage
 from .pads import PadPress as PadPress
+from .pads import image_modes as image_modes
 from .pads import pad_metrics as pad_metrics
 from .pads import press_pads as press_pads
 from .press import press_peaks as press_peaks

@@ -19,7 +19,7 @@ from raytac.gel.surface import GelSurface
 from raytac.io.folder import result_folder
 from raytac.io.metrics import Metric, versions, write_metrics
 from raytac.physics import Ipc, PhysicsConfig, Rigid
-from raytac.report.measure import machine
+from raytac.report.measure import machine, timed_within
 from raytac.report.preview import camera_extent_mm
 from raytac.report.style import STYLE
 from raytac.sensor import TactileSensor
@@ -33,7 +33,7 @@ NEAR, BEYOND = 1e-3, 2e-3
 """Distances from the contact [m] at which the zones of a height difference end."""
 STEP_MM = 0.05
 """A scale of height differences ends at a multiple of this."""
-FILES = ("report.html", "sheet.png", "metrics.json")
+FILES = ("report.html", "sheet.png", "error_cost.png", "metrics.json")
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,18 @@ class PadPress:
     frame: TactileFrame
     seconds: float
     """Time of the whole press with its image [s]."""
+
+
+@dataclass(frozen=True)
+class ModeImage:
+    """Image of one optical mode on the finest pad's surface of a scene."""
+
+    scene: str
+    mode: str
+    image: float
+    """Mean absolute difference to the ray tracer's image of that surface [levels of 255]."""
+    frame_ms: float
+    """Median time of an image [ms]."""
 
 
 def press_pads(
@@ -89,13 +101,36 @@ def press_pads(
     return made, sensors[list(pads)[-1]]
 
 
-def pad_metrics(presses: Sequence[PadPress]) -> dict[str, Metric]:
+def image_modes(presses: Sequence[PadPress], sensor: TactileSensor, modes: Sequence[str]) -> list[ModeImage]:
+    """Images of other optical modes on the surfaces of the finest pad.
+
+    Errors of a pad and of an image mode are then in one unit, and a plot shows which of both is worth its time.
+
+    Args:
+        presses, sensor: as ``press_pads`` returns them.
+        modes: names of optical modes that need no file of their own, such as ``taxim``, which is baked at first use.
+    """
+    finest = {press.scene: press.frame for press in presses}
+    made = []
+    for mode in modes:
+        given = {"resolution": sensor.resolution, "device": sensor.device, "seed": sensor.seed}
+        other = TactileSensor(sensor.spec, optics=mode, outputs=("rgb",), **given)
+        for scene, frame in finest.items():
+            image = other.update(frame.surface).rgb
+            assert image is not None and frame.rgb is not None
+            times = timed_within(lambda surface, other=other: other.update(surface).rgb, [frame.surface], 5, 1.0)
+            off = float(np.abs(image[0].astype(float) - frame.rgb[0]).mean())
+            made.append(ModeImage(scene, mode, off, float(np.median(times))))
+    return made
+
+
+def pad_metrics(presses: Sequence[PadPress], images: Sequence[ModeImage] = ()) -> dict[str, Metric]:
     """``SCENE.PAD.*`` of every press, and its differences to the finest pad's.
 
     ``press_s``; ``imprint_mm`` (deepest), ``bulge_mm`` (highest above rest), ``contact_mm2``, ``force_n``. But for the finest pad also root
     mean square differences of height: ``contact_um`` (where both touch: small between soft pads, which are all laid on the object there),
     ``near_um`` (outside the contact of either, up to 1 mm from it) and ``beyond_um`` (1 to 2 mm from it); and ``image``: mean absolute
-    difference of the images [levels of 255].
+    difference of the images [levels of 255]. Of ``images`` ``SCENE.MODE.image`` and ``SCENE.MODE.frame_ms``.
     """
     finest = {press.scene: press for press in presses}
     metrics: dict[str, Metric] = {}
@@ -104,6 +139,8 @@ def pad_metrics(presses: Sequence[PadPress]) -> dict[str, Metric]:
         if press is not finest[press.scene]:
             values |= differences(press.frame, finest[press.scene].frame)
         metrics |= {f"{press.scene}.{press.pad}.{key}": value for key, value in values.items() if np.isfinite(value)}
+    for one in images:
+        metrics |= {f"{one.scene}.{one.mode}.image": one.image, f"{one.scene}.{one.mode}.frame_ms": one.frame_ms}
     return metrics
 
 
@@ -147,9 +184,11 @@ def widened(mask: np.ndarray, by: float, pitch: tuple[float, float]) -> np.ndarr
     return out
 
 
-def write_pads(presses: Sequence[PadPress], sensor: TactileSensor, out: Path, wall_s: float) -> list[Path]:
-    """Write ``report.html`` (one file), ``sheet.png`` and ``metrics.json``; returns their paths."""
-    metrics = pad_metrics(presses)
+def write_pads(
+    presses: Sequence[PadPress], sensor: TactileSensor, out: Path, wall_s: float, images: Sequence[ModeImage] = ()
+) -> list[Path]:
+    """Write ``report.html`` (one file), both pictures and ``metrics.json``; returns their paths."""
+    metrics = pad_metrics(presses, images)
     facts: dict[str, Metric] = {
         "command": "compare-physics",
         "sensor": sensor.spec.name,
@@ -158,10 +197,45 @@ def write_pads(presses: Sequence[PadPress], sensor: TactileSensor, out: Path, wa
     }
     with result_folder(out, FILES) as folder:
         sheet_figure(presses, sensor).savefig(folder / "sheet.png", pil_kwargs={"optimize": True})
-        page = _page(presses, metrics, facts, (folder / "sheet.png").read_bytes())
+        error_cost_figure(presses, images).savefig(folder / "error_cost.png", pil_kwargs={"optimize": True})
+        pictures = [(folder / name).read_bytes() for name in ("sheet.png", "error_cost.png")]
+        page = _page(presses, metrics, facts, *pictures)
         (folder / "report.html").write_text(page, encoding="utf-8")
         write_metrics(folder / "metrics.json", facts | metrics | versions() | versions(["warp-lang"]) | {"wall_s": wall_s})
     return [out / name for name in FILES]
+
+
+def error_cost_figure(presses: Sequence[PadPress], images: Sequence[ModeImage] = ()) -> Figure:
+    """Image error against time of pads and of image modes; a line from best to worst scene.
+
+    The finest pad, with the ray tracer, is the reference: it has a time and no error.
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    finest = {press.scene: press for press in presses}
+    points: dict[str, list[tuple[float, float]]] = {}
+    for press in presses:
+        off = differences(press.frame, finest[press.scene].frame)["image"]
+        points.setdefault(f"{press.pad} pad" if press.pad == RIGID else f"soft pad, {press.pad}", []).append((press.seconds, off))
+    for one in images:
+        points.setdefault(f"{one.mode}, on the finest pad", []).append((1e-3 * one.frame_ms, one.image))
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 3.4), layout="constrained", dpi=100)
+        axes = figure.subplots()
+        for k, (name, values) in enumerate(points.items()):
+            seconds, offs = float(np.median([s for s, _ in values])), [off for _, off in values]
+            if not max(offs) > 0.0:
+                axes.axvline(seconds, color=f"C{k}", linestyle=":", label=f"{name}: the reference")
+                continue
+            marker = "^" if name.endswith("finest pad") else "o"
+            axes.plot([seconds] * 2, [min(offs), max(offs)], color=f"C{k}", linewidth=0.8, alpha=0.6)
+            axes.plot(seconds, np.mean(offs), color=f"C{k}", marker=marker, linestyle="none", label=name)
+        axes.set(xscale="log", xlabel="time of a press with its image (circles), of an image (triangles) [s]")
+        axes.set(yscale="log", ylabel="image, mean absolute\ndifference [levels of 255]")
+        axes.grid(True, linewidth=0.3, color="0.9")
+        figure.legend(loc="outside right upper", frameon=False)
+    return figure
 
 
 def sheet_figure(presses: Sequence[PadPress], sensor: TactileSensor) -> Figure:
@@ -223,7 +297,9 @@ _COLUMNS: Mapping[str, tuple[str, str]] = {
 """Heading and number format of each figure of the report."""
 
 
-def _page(presses: Sequence[PadPress], metrics: Mapping[str, Metric], facts: Mapping[str, Metric], sheet: bytes) -> str:
+def _page(
+    presses: Sequence[PadPress], metrics: Mapping[str, Metric], facts: Mapping[str, Metric], sheet: bytes, cost: bytes
+) -> str:
     head = "".join(f"<th>{html.escape(text)}</th>" for text, _ in _COLUMNS.values())
     lines = []
     for press in presses:
@@ -243,5 +319,8 @@ around the contact of either up to 1 mm, and 1 to 2 mm from it; of the image, me
 and that of a pad's first press what is made once.</p>
 <table><tr><th>scene</th><th>pad</th>{head}</tr>{"".join(lines)}</table>
 <p><img alt="Images, indentations and height differences" src="data:image/png;base64,{base64.b64encode(sheet).decode("ascii")}"></p>
+<p>Error against time: how far the images of a pad are from those of the {finest} soft pad, and how far other image modes are from the ray
+tracer on that pad's surface. Median time and mean over the scenes; lines go from the best scene to the worst.</p>
+<p><img alt="Image error against time" src="data:image/png;base64,{base64.b64encode(cost).decode("ascii")}"></p>
 <table>{said}</table></body></html>
 """

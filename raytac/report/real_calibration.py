@@ -152,7 +152,9 @@ def run_calibrate_optics(
             for part, chosen, some in (("fitted", ~is_test, train), ("held_out", is_test, test)):
                 if not chosen.any():
                     continue
-                images = drifts.take(chosen).applied(images_of(one, sensor, some, circles[chosen], fitted.state.slopes))
+                images = drifts.take(chosen).applied(
+                    images_of(one, models.sensor_of(name), some, circles[chosen], fitted.state.slopes)
+                )
                 scores = press_scores(sensor, images, some)
                 key = part if name == model else f"{part}.alone"
                 for prefix, of in ((key, whole[chosen]), (f"border.{key}", ~whole[chosen])):

@@ -70,6 +70,7 @@ ABLATIONS: dict[str, Ablation] = {
     "no_colour_matrix": Ablation(sensor=lambda s: replace(s, response=replace(s.response, colour_mix=UNMIXED)), fixed=("mix",)),
     "no_tone_curve": Ablation(sensor=lambda s: replace(s, response=replace(s.response, tone=())), fixed=("tone",)),
     "one_led_a_colour": Ablation(sensor=_one_a_colour),
+    "given_camera": Ablation(fixed=("distance", "distortion")),
     "rigid_pad_imprint": HELD,
     "one_photograph_at_rest": Ablation(settle=False),
     "no_session_drift": Ablation(drift=False),
@@ -160,7 +161,7 @@ class RealFits:
             self._score_imprints(models, train, test)
         if not self.device:
             some = shots.take(test)
-            self._other_metrics |= {f"{mode}.ms": t for mode, t in mode_times(models, sensor, some, some.circles).items()}
+            self._other_metrics |= {f"{mode}.ms": t for mode, t in mode_times(models, some, some.circles).items()}
             self.device = models.modes["raytrace"].device
 
     def run_ablation(self, name: str, split: Split) -> None:
@@ -169,7 +170,7 @@ class RealFits:
         ablation = replace(ABLATIONS[name], prior=ABLATIONS[name].prior or self.priors["press"][0])
         changed = ablation.sensor(self._sensor)
         models = self._fit(changed, train, modes=("raytrace",), ablation=ablation)
-        images, _ = _tested(models, changed, self._shots.take(test))
+        images, _ = _tested(models, self._shots.take(test))
         scores = press_scores(self._sensor, images["raytrace"], self._shots.take(test))
         self._other_metrics |= {f"ablation.{name}.{key}": value for key, value in summary(scores).items()}
 
@@ -196,7 +197,7 @@ class RealFits:
     def _test(self, kind: str, models: Models, numbers: np.ndarray) -> dict[str, np.ndarray]:
         """Score presses at refined and at labelled circles; images at the refined ones by mode."""
         shots = self._shots.take(numbers)
-        refined, labelled = _tested(models, self._sensor, shots)
+        refined, labelled = _tested(models, shots)
         self.tested.setdefault(kind, []).extend(self._presses.names[k] for k in numbers)
         for name, images in ((kind, refined), (f"labelled_{kind}", labelled)):
             for mode, stack in images.items():
@@ -233,7 +234,7 @@ class RealFits:
         )
 
 
-def _tested(models: Models, sensor: SensorSpec, shots: Photographs) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def _tested(models: Models, shots: Photographs) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Images of every mode and of the background at refined circles and at labelled ones.
 
     Modes' images have the session drift of their photographs; the background is the one photograph at rest.
@@ -242,7 +243,10 @@ def _tested(models: Models, sensor: SensorSpec, shots: Photographs) -> tuple[dic
     nothing = np.broadcast_to(shots.background, shots.presses.shape)
     scores = []
     for circles in (refined, shots.circles):
-        own = {name: drift.applied(images_of(mode, sensor, shots, circles, slopes)) for name, mode in models.modes.items()}
+        own = {
+            name: drift.applied(images_of(mode, models.sensor_of(name), shots, circles, slopes))
+            for name, mode in models.modes.items()
+        }
         scores.append(own | {"background": nothing})
     return scores[0], scores[1]
 
@@ -250,6 +254,7 @@ def _tested(models: Models, sensor: SensorSpec, shots: Photographs) -> tuple[dic
 def _outliers(models: Models, sensor: SensorSpec, shots: Photographs, names: Sequence[str]) -> dict[str, str]:
     """Fitted presses that disagree with the others, and why, by the fitted ray tracer."""
     state, drift = models.fitted.state, models.settled.drift
-    images = drift.applied(images_of(models.modes["raytrace"], sensor, shots, state.circles, state.slopes))
+    mode, lit = models.modes["raytrace"], models.fitted.sensor
+    images = drift.applied(images_of(mode, lit, shots, state.circles, state.slopes))
     errors = np.array([score["contact_mae"] for score in press_scores(sensor, images, shots)])
     return outliers(names, errors, state.circles, shots)

@@ -49,7 +49,8 @@ def imprint_scores(
         circles = np.column_stack([lit.circles(shots)[:, :2], shots.circles[:, 2]])
         if name == FITTED:
             drift = models.drift(shots)
-            images = drift.applied(images_of(models.modes[_MODE], sensor, shots, circles, models.fitted.state.slopes))
+            own = models.fitted
+            images = drift.applied(images_of(models.modes[_MODE], own.sensor, shots, circles, own.state.slopes))
             out[f"{name}.{_MODE}"] = press_scores(sensor, images, shots)
         else:
             physics: PhysicsConfig = Rigid() if name == "rigid" else Ipc(level=level)
@@ -70,7 +71,7 @@ def _press(
     drift = models.drift(shots)
     keys = name, f"{name}.{_MODE}", f"{name}.{AT_OVERLAP}.{_MODE}"
     own, at_depth, at_overlap = (out.setdefault(key, []) for key in keys)
-    balls = pressed_balls(sensor, circles, shots.radius, physics, pitch=GRID_PITCH, device=device)
+    balls = pressed_balls(models.fitted.sensor, circles, shots.radius, physics, pitch=GRID_PITCH, device=device)
     for k, ball in enumerate(balls):
         one = shots.take(np.array([k]))
         for scores, surface in ((at_overlap, ball.at_overlap), (at_depth, ball.surface)):

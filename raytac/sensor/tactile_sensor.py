@@ -283,6 +283,10 @@ class TactileSensor:
         press = press_scene(scene)
         own_seeds = None if seeds is None else check_seeds("seeds", seeds, self.num_envs)
         self._used = scene_physics(self.physics, press)
+        if self._used.is_simulated and self._optical_outputs and resolve_device(self.device) == "cpu":
+            from raytac.optics.runtime import share_cores
+
+            share_cores()  # the solver runs between two images
         targets = TargetArrays(offsets=offsets, depths=depths, rotations=rotations, shears=shears, twists=twists)
         self._pad = self._used.build(self.spec, press, pitch=self.pitch, num_envs=self.num_envs, device=self.device, **targets)
         self._has_warned = False

@@ -6,13 +6,14 @@ import hashlib
 import io
 import logging
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from raytac.errors import MeshError
+from raytac.io.progress import Progress
 from raytac.specs.files import is_file
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".off", ".glb")
@@ -22,6 +23,8 @@ _FARTHEST = 1e9
 """Farthest that a vertex may be [file units]: beyond it vertices cannot be distinguished."""
 SIZE_RANGE = (1e-4, 0.5)
 """Largest extent that an object may have [m]; outside it, the scale is almost surely wrong."""
+_LARGE_FILE = 10_000_000
+"""Bytes from which reading a file shows its progress: 200,000 triangles of a binary STL."""
 _LOG = logging.getLogger("raytac")
 
 
@@ -49,6 +52,8 @@ class TriangleMesh:
 def load_mesh(path: str | Path, scale: float, *, repair: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and faces of a closed surface.
 
+    A file that has not changed since is read, checked and repaired once. Of a large one, progress is shown on standard error.
+
     Args:
         path: STL, OBJ, PLY, OFF or GLB file.
         scale: metres per file unit: 0.001 for a file in millimetres.
@@ -66,8 +71,20 @@ def load_mesh(path: str | Path, scale: float, *, repair: bool = False) -> tuple[
     _check_scale(scale, path)
     if not is_file(path):
         raise MeshError("the mesh file does not exist", file=path)
-    mesh = _read(path)
-    return closed_mesh(mesh.vertices, mesh.faces, scale, file=path, repair=repair)
+    state = path.stat()
+    vertices, faces = _solid_of_file(path.absolute(), scale, repair, (state.st_ino, state.st_mtime_ns, state.st_size))
+    return vertices.copy(), faces.copy()
+
+
+@lru_cache(maxsize=2)
+def _solid_of_file(path: Path, scale: float, repair: bool, state: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Closed surface of a file, kept while ``state`` (inode, time, size) is the same."""
+    with Progress(desc=f"read {path.name}", total=2, unit="step", show=state[2] >= _LARGE_FILE, leave=False) as bar:
+        mesh = _read(path)
+        bar.update()
+        solid = closed_mesh(mesh.vertices, mesh.faces, scale, file=path, repair=repair)
+        bar.update()
+    return solid
 
 
 def closed_mesh(

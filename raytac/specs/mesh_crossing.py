@@ -6,12 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from raytac.io.progress import Progress
+
 _CHUNK = 1 << 18
 """Most pairs of boxes that are looked at together."""
 _MOST_PAIRS = 20_000
 """Crossing pairs after which the search ends: nobody repairs them one by one."""
 _MOST_TESTS = 200_000_000
 """Pairs with overlapping boxes that end the search; a sound million triangles have a tenth."""
+_LARGE = 200_000
+"""Triangles from which a search shows its progress: it takes seconds from there on."""
 _ROUNDING = 16 * np.finfo(np.float64).eps
 """Bound of a triple product's rounding error, over the product of the lengths."""
 
@@ -46,7 +50,7 @@ def find_crossings(vertices: np.ndarray, faces: np.ndarray) -> Crossings:
     A bounding-volume hierarchy over the triangles in Morton order is descended against itself, level by level, in chunks, so that memory
     stays bounded. An edge crosses a triangle if its ends lie on different sides of the plane and its line passes through the triangle
     (signs of triple products, Möller and Trumbore's). An end that lies on the triangle to rounding counts as crossing. Two triangles in
-    one plane overlap if no edge's normal separates them.
+    one plane overlap if no edge's normal separates them. Of a large mesh, progress is shown on standard error.
 
     Args:
         vertices: (V, 3).
@@ -55,27 +59,33 @@ def find_crossings(vertices: np.ndarray, faces: np.ndarray) -> Crossings:
     corners = np.asarray(vertices, np.float64)[faces]
     order = _morton_order(corners)
     levels = _boxes(corners[order])
-    stack = [(0, np.zeros((1, 2), np.int64))]
+    # Each entry: level, pairs of nodes there, and the part of the surface that they stand for.
+    stack = [(0, np.zeros((1, 2), np.int64), float(len(faces)))]
     batches: list[np.ndarray] = []
     tests = count = 0
+    done = 0.0
     is_complete = True
-    while stack:
-        depth, nodes = stack.pop()
-        low, high = levels[depth]
-        a, b = nodes.T
-        nodes = nodes[((low[a] <= high[b]) & (low[b] <= high[a])).all(axis=1)]
-        if depth < len(levels) - 1:
-            children = _children(nodes)
-            stack += [(depth + 1, children[start : start + _CHUNK]) for start in range(0, len(children), _CHUNK)]
-            continue
-        pairs = order[nodes[nodes[:, 0] != nodes[:, 1]]]
-        tests += len(pairs)
-        crossing = pairs[_meet(corners, faces, pairs)]
-        count += len(crossing)
-        batches.append(np.sort(crossing, axis=1))
-        if (count > _MOST_PAIRS or tests > _MOST_TESTS) and stack:
-            is_complete = False
-            break
+    with Progress(desc="check triangles", total=len(faces), unit="triangle", show=len(faces) >= _LARGE, leave=False) as bar:
+        while stack:
+            depth, nodes, share = stack.pop()
+            low, high = levels[depth]
+            a, b = nodes.T
+            nodes = nodes[((low[a] <= high[b]) & (low[b] <= high[a])).all(axis=1)]
+            if depth < len(levels) - 1 and len(nodes):
+                children = _children(nodes)
+                chunks = [children[start : start + _CHUNK] for start in range(0, len(children), _CHUNK)]
+                stack += [(depth + 1, chunk, share * len(chunk) / len(children)) for chunk in chunks]
+                continue
+            done += share
+            bar.update(int(done) - bar.n)
+            pairs = order[nodes[nodes[:, 0] != nodes[:, 1]]]
+            tests += len(pairs)
+            crossing = pairs[_meet(corners, faces, pairs)]
+            count += len(crossing)
+            batches.append(np.sort(crossing, axis=1))
+            if (count > _MOST_PAIRS or tests > _MOST_TESTS) and stack:
+                is_complete = False
+                break
     pairs = np.concatenate(batches) if batches else np.zeros((0, 2), np.int64)
     pairs = pairs[np.lexsort(pairs.T[::-1])]
     place = tuple(float(v) for v in corners[pairs[0]].mean(axis=(0, 1))) if len(pairs) else None

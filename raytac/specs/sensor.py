@@ -221,7 +221,8 @@ class CameraSpec:
     """Size of one native pixel on the plane z = 0 along x and y [m].
     It holds where the optical axis meets the plane; of a tilted camera, across that axis."""
     position: Vec3
-    """Pinhole (centre of projection), pad frame [m]; z < 0. The image centre looks along +z."""
+    """Pinhole (centre of projection), pad frame [m]; z < 0. The image centre looks along +z.
+    It may lie behind the case's floor: behind gel and plate a camera seems farther away."""
     principal_point: Vec2
     """Pixel, in native pixels from the top-left image corner, that the optical axis meets [px]."""
     distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)

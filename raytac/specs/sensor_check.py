@@ -34,7 +34,7 @@ def validate_sensor(sensor: SensorSpec) -> None:
 
     Raises:
         SpecError: the dome is deeper than the pad, or a map of its surface does not cover the pad, rises above the case, or falls below
-            the bonded face; the camera lies in the gel, outside the case, or sees past the pad; its
+            the bonded face; the camera lies in the gel, beyond the case's walls, or sees past the pad; its
             distortion has no inverse, or its tilt is too large; the vignette leaves no light; the tone curve falls; colour shading has a
             wrong number of coefficients or might overflow; markers lie off the pad; an LED lies in the gel, above the dome, or outside the
             case, a virtual one above the dome, in the camera's view or where light refracts; with ``refraction.model = "slab"``, camera or
@@ -126,8 +126,8 @@ def _check_camera(sensor: SensorSpec) -> None:
     pad, case, camera = sensor.gelpad, sensor.case, sensor.camera
     x, y, _ = camera.position
     _check_camera_behind(sensor)
-    if not _in_case(sensor, camera.position):
-        rule = f"the camera must lie inside the case, {_case_rule(sensor)}"
+    if any(abs(c) > size / 2 + _SLACK for c, size in zip((x, y), case.size, strict=True)):  # behind its floor it may lie
+        rule = f"the camera must lie between the case's walls, |x| <= {case.size[0] * 500:.4g} mm, |y| <= {case.size[1] * 500:.4g} mm"
         raise _error(sensor, "camera.position_mm", in_mm(camera.position), rule)
     _check_lens(sensor)
     if camera.lens.is_plain:

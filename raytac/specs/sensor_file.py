@@ -212,14 +212,16 @@ _MOTION, _SURFACE = "marker_motion.toml", "surface.csv"
 def sensor_files(sensor: SensorSpec) -> dict[str, str]:
     """Texts by name of file: ``sensor.toml``, and further files that it needs.
 
-    Its lights are in a ``lights.toml`` beside it, which is not among them. A sensor whose lights, response, optics and noise are all that
-    it does not have from a shipped one names that as its base; any other holds every table itself. Markers' motion is a shipped name or a
-    file beside it, the map of a pad's surface a file beside it. No path of this machine is in it.
+    Its lights are in a ``lights.toml`` beside it, which is not among them. A sensor whose lights, camera, response, optics and noise are
+    all that it does not have from a shipped one names that as its base; any other holds every table itself. Markers' motion is a shipped
+    name or a file beside it, the map of a pad's surface a file beside it. No path of this machine is in it.
     """
     files: dict[str, str] = {}
     base = _shipped_base(sensor)
     head = ['lights = "lights.toml"'] if base is None else [f'base = "{base}"', 'lights = "lights.toml"']
     tables = ["response", "optics", "noise"] if base is not None else [name for name in SENSOR_SCHEMA if name]
+    if base is not None and sensor.camera != load_sensor(base).camera:
+        tables.insert(0, "camera")
     if sensor.noise.is_none and (base is None or load_sensor(base).noise.is_none):
         tables.remove("noise")
     if base is None and sensor.marker_motion is not None:
@@ -246,12 +248,13 @@ def gelpad_files(sensor: SensorSpec, base: str, comment: str) -> dict[str, str]:
 
 
 def _shipped_base(sensor: SensorSpec) -> str | None:
-    """Name of the shipped sensor that this is but for lights, response, optics, noise; or None."""
+    """Name of the shipped sensor that this is but for what ``sensor_files`` says; or None."""
     source = sensor.source
     if source is None or source.stem not in available("sensor") or source.resolve() != find_file("sensor", source.stem).resolve():
         return None
     shipped = load_sensor(source.stem)
-    own = replace(sensor, lights=shipped.lights, response=shipped.response, optics=shipped.optics, noise=shipped.noise)
+    parts = {name: getattr(shipped, name) for name in ("lights", "camera", "response", "optics", "noise")}
+    own = replace(sensor, **parts)
     return source.stem if own == shipped else None
 
 

@@ -23,7 +23,7 @@ from tests.calibrate.test_light_fit import RADIUS, circles, direct, traced
 from tests.optics.test_strip import PANEL, STRIP, line_irradiance, rectangle_irradiance
 
 DIRECT = RayTraced(shadows=False, bounce=False)
-SETTINGS = FitSettings(fixed=("gamma", "tone", "stray", "slope"), samples=(150, 100), prior=1.0)
+SETTINGS = FitSettings(fixed=("gamma", "tone", "stray", "slope", "mix", "distance", "distortion"), samples=(150, 100), prior=1.0)
 
 
 def strips(z: float, length: float = 18.0, height: float = 1.0, virtual: bool = False) -> SensorSpec:
@@ -77,7 +77,7 @@ def test_direct_light_is_the_ray_tracers(size: tuple[float, float]) -> None:
     sensor, at = strips(-8.0, *size), circles(3)
     state = FitState(rows(sensor), RIGID_PAD.copy(), at)
     problem = DirectFit(sensor, blank(at), state, FitSettings(samples=(200, 200)))
-    plain = problem.light(state.p, problem.geometry(state))
+    plain = problem.light(state)
     extra = extra_light(problem, state, make_grid(sensor.gelpad, 0.06e-3), "cpu", DIRECT)
     assert not extra.by_led
     for one, other in zip(extra.light.parts, plain.parts, strict=True):

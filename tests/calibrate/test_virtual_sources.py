@@ -21,7 +21,7 @@ from raytac.specs.sensor_check import validate_sensor, view_edges
 from raytac.specs.sensor_file import lights_text, load_lights
 from tests.calibrate.test_light_fit import circles, direct
 
-SETTINGS = FitSettings(fixed=("gamma", "tone", "stray", "slope"), samples=(150, 100))
+SETTINGS = FitSettings(fixed=("gamma", "tone", "stray", "slope", "distance", "distortion"), samples=(150, 100))
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +152,7 @@ def test_a_round_that_is_worse_is_taken_back_and_the_next_is_shorter(mini: Senso
     places: list[np.ndarray] = []
 
     def misleading(problem: DirectFit, state: FitState, *_: object, **__: object) -> ExtraLight:
-        light = problem.light(state.p, problem.geometry(state))
+        light = problem.light(state)
         places.append(state.p.leds.copy())
         away = state.p.leds[:, 0] - true.p.leds[:, 0]
         part = Light(*(0 * one + 0.4 * away[:, None, None] ** 2 * one.mean() for one in light.parts))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -112,3 +114,13 @@ def test_more_reflections_only_add_light(tracer: Build, spec: SensorSpec, presse
     assert means[1] < means[2] < means[3] < means[-1] * 1.001, means
     # Each further reflection loses at least the darker of coat and wall.
     assert means[3] - means[2] < 0.6 * (means[2] - means[1]), means
+
+
+def test_a_pinhole_behind_the_floor_sees_through_it(tracer: Build, spec: SensorSpec, pressed: GelSurface) -> None:
+    """As with a floor that lies behind the pinhole, but for light by way of the floor."""
+    camera, floor = replace(spec.camera, position=(0.0, 0.0, -40e-3)), replace(spec.case, reflectance=0.0)
+    images = [
+        image(tracer, replace(spec, camera=camera, case=replace(floor, floor_z=z)), pressed, 16) for z in (-28.5e-3, -41e-3)
+    ]
+    assert images[1].mean() > 0
+    np.testing.assert_allclose(images[0], images[1], atol=1e-3 * images[1].max())

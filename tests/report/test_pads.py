@@ -15,10 +15,12 @@ from raytac.report import pads
 
 
 def test_a_quick_comparison_reports_both_pads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    costs, draw_cost = [], pads.error_cost_figure
+    monkeypatch.setattr(pads, "error_cost_figure", lambda *args: costs.append(draw_cost(*args)) or costs[-1])
     drawn, draw = [], pads.sheet_figure
     monkeypatch.setattr(pads, "sheet_figure", lambda *args: drawn.append(draw(*args)) or drawn[-1])
     assert main(["compare-physics", "--quick", "--scenes", "sphere,coin", "--device", "cpu", "--out", str(tmp_path)]) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["metrics.json", "report.html", "sheet.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["error_cost.png", "metrics.json", "report.html", "sheet.png"]
     assert read_png(tmp_path / "sheet.png").shape[2] == 3
     maps = [axis.images[0] for axis in drawn[0].axes if axis.images and axis.images[0].get_array().ndim == 2]
     assert len(maps) == 3  # two indentations and their difference
@@ -36,6 +38,13 @@ def test_a_quick_comparison_reports_both_pads(tmp_path: Path, monkeypatch: pytes
     assert metrics["sphere.coarse.bulge_mm"] > 0.005 > metrics["sphere.rigid.bulge_mm"]
     assert metrics["sphere.rigid.contact_um"] < 5.0 < metrics["sphere.rigid.beyond_um"] < 60.0
     assert 0.0 < metrics["sphere.rigid.image"] < 20.0 and "sphere.coarse.image" not in metrics
+    # Pads and image modes in one plot: the finest pad is the reference, the others have an error beside their time.
+    curves = {line.get_label(): line for line in costs[0].axes[0].lines if not str(line.get_label()).startswith("_")}
+    assert set(curves) == {"rigid pad", "soft pad, coarse: the reference", "phong, on the finest pad"}
+    at = {name: tuple(float(np.atleast_1d(v)[0]) for v in curves[name].get_data()) for name in curves}
+    assert at["rigid pad"] == pytest.approx((metrics["sphere.rigid.press_s"], metrics["sphere.rigid.image"]))
+    phong = (1e-3 * metrics["sphere.phong.frame_ms"], metrics["sphere.phong.image"])
+    assert at["phong, on the finest pad"] == pytest.approx(phong) and phong[0] < 1.0 < phong[1]
     page = (tmp_path / "report.html").read_text("utf-8")
     assert f"<td>{metrics['sphere.coarse.force_n']:.2f}</td>" in page and "data:image/png;base64," in page
 
@@ -66,5 +75,6 @@ def test_bad_input(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=text):
             pads.press_pads(scenes, levels)
     assert main(["compare-physics", "--levels", "coarse,huge", "--out", str(tmp_path / "out")]) == 2
+    assert main(["compare-physics", "--modes", "phong,taxi", "--out", str(tmp_path / "out")]) == 2
     assert main(["compare-physics", "--scenes", "sphre", "--out", str(tmp_path / "out")]) == 2
     assert not (tmp_path / "out").exists()

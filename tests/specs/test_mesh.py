@@ -258,3 +258,20 @@ def test_what_cannot_be_closed_is_refused(tmp_path: Path, caplog: pytest.LogCapt
     with pytest.raises(MeshError, match="cannot be repaired"):
         load_mesh(tmp_path / "fin.stl", 0.001, repair=True)
     assert not caplog.records
+
+
+def test_a_file_is_read_once_until_it_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from raytac.specs import mesh as module
+
+    path, reads = tmp_path / "cube.stl", []
+    read = module._read
+    monkeypatch.setattr(module, "_read", lambda file: reads.append(file) or read(file))
+    CUBE.export(path)
+    vertices, faces = load_mesh(path, 0.001)
+    vertices[:], faces[:] = 0.0, 0  # the caller's own arrays
+    again, _ = load_mesh(path, 0.001)
+    assert np.ptp(again, axis=0) == pytest.approx([10e-3, 8e-3, 6e-3]) and len(reads) == 1
+    load_mesh(path, 0.002)
+    assert len(reads) == 2
+    trimesh.creation.box(extents=(5.0, 4.0, 3.0)).export(path)
+    assert np.ptp(load_mesh(path, 0.001)[0], axis=0) == pytest.approx([5e-3, 4e-3, 3e-3]) and len(reads) == 3

@@ -120,3 +120,26 @@ def test_a_user_is_told_how_many_triangles_of_a_mesh_cross_and_where(tmp_path: P
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         load_press(tmp_path / "own.toml")
+
+
+def test_a_large_mesh_shows_its_progress_and_a_small_one_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    counts: list[list[int]] = []
+
+    class Counted(module.Progress):
+        def __init__(self, *args: object, **options: object) -> None:
+            super().__init__(*args, **options)  # type: ignore[arg-type]
+            counts.append([self.total, int(not self.disable)])
+
+        def close(self) -> None:
+            counts[-1].append(self.n)
+            super().close()
+
+    monkeypatch.setattr(module, "Progress", Counted)
+    monkeypatch.setattr(module, "_CHUNK", 1 << 10)
+    assert not find_crossings(ball.vertices, ball.faces)
+    assert counts.pop()[:2] == [1280, 0]
+    monkeypatch.setattr(module, "_LARGE", 1280)
+    assert not find_crossings(ball.vertices, ball.faces)
+    total, shown, done = counts[-1][:3]
+    assert (total, shown) == (1280, 1) and done >= 1279  # shares of chunks add up, to rounding

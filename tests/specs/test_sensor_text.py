@@ -33,6 +33,11 @@ def test_a_shipped_sensor_is_named_as_base_and_another_is_written_as_a_whole(nam
     sensor = replace(shipped, optics=OpticsSpec(shadows=False), response=response)
     assert sensor_files(sensor)["sensor.toml"].startswith(f'base = "{name}"\n')
     assert same(sensor, written(sensor, tmp_path / "based"))
+    x, y, z = sensor.camera.position
+    farther = replace(sensor, camera=replace(sensor.camera, position=(x, y, round(1.25 * z, 5))))
+    text = sensor_files(farther)["sensor.toml"]
+    assert text.startswith(f'base = "{name}"\n') and "[camera]" in text and "[camera]" not in sensor_files(sensor)["sensor.toml"]
+    assert same(farther, written(farther, tmp_path / "farther"))
     for other in (
         replace(sensor, source=None),
         replace(sensor, coat=replace(sensor.coat, roughness=0.123456789)),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -120,3 +122,16 @@ def test_the_command_knows_what_is_played(folder, tmp_path):
         ViewArgs(scene=str(tmp_path / "none.pt"))._played()
     with pytest.raises(InputError, match="scripted"):
         ViewArgs(scene="LiftCube", policy="clever")._played()
+
+
+@pytest.mark.parametrize(
+    ("lacking", "scene", "extra"), [("gymnasium", "lift_cube_ppo", "raytac[envs]"), ("pyarrow", "presses", "raytac[dataset]")]
+)
+def test_what_is_played_names_the_extra_that_it_lacks(lacking, scene, extra, folder):
+    scene = str(folder) if scene == "presses" else scene
+    code = (
+        f"import sys; sys.modules[{lacking!r}] = None; "
+        f"from raytac.cli import main; sys.exit(main(['view', {scene!r}, '--port', '0']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 2 and done.stderr.startswith("raytac: error: ") and f"pip install '{extra}'" in done.stderr

@@ -50,9 +50,10 @@ class Small:
     ``touched``, ``slot`` (B, s): mark of a surface node that touches, and its place among the contact nodes.
     ``count`` (B,): contact nodes; more than m do not fit.    ``pads`` (B,): those of pads, the first ones.    ``node`` (B, m).
     ``known`` (B,): pad nodes of which ``k`` is K; −1 after ``node`` has changed.
-    ``s`` (B, 3m, 3m): the upper half of S, zero after the inverse was computed.    ``k`` (B, 3m, 3m): K of pad nodes [N/m].
-    ``inverse`` (B, 3m, 3m): (K + S)⁻¹ [m/N].
-    ``t``, ``force`` (B, 3m): J K_0⁻¹ r [m], on affine nodes L⁻¹ r, later a product; and W t [N].
+    ``s`` (B, 3m, 3m): the upper half of S, zero after it was used.    ``k`` (B, 3m, 3m): K of pad nodes [N/m].
+    ``factor`` (B, 3m, 3m): U of K + S = Uᵀ U (``dense.py``).
+    ``t``, ``force`` (B, 3m): J K_0⁻¹ r [m], on affine nodes L⁻¹ r, later (K + S)⁻¹ K of it; and W t [N].
+    ``half`` (B, 3m): half of that solution, U⁻ᵀ K t.
     ``root`` (B, A, 4): blocks of an affine node's row of L⁻¹, at the nodes of its body.
     """
 
@@ -64,8 +65,9 @@ class Small:
     known: IntArray
     s: FloatArray3d
     k: FloatArray3d
-    inverse: FloatArray3d
+    factor: FloatArray3d
     t: FloatArray2d
+    half: FloatArray2d
     force: FloatArray2d
     root: wp.array3d(dtype=wp.mat33d)
 

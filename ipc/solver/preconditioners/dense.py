@@ -1,11 +1,11 @@
-"""Dense symmetric matrices, inverted by one block of threads each.
+"""Dense positive definite matrices, factored, solved and inverted by a block of threads each.
 
-A = Uᵀ U is computed by panels of ``PANEL`` rows (a left-looking Cholesky factorisation). A thread works on columns, two at a time, and
-keeps the panel's share of both in registers while it runs down the rows above. Threads side by side read numbers side by side, and all
-of them the same few of the panel. So a number is read once for a panel instead of once for a row, and matrices stay where they are, in
-global memory: 1.4 MB for 140 contact nodes are too many for a block's own.
+A = Uᵀ U is computed by panels of ``PANEL`` rows (a left-looking Cholesky factorisation), of which two share their sums over the rows above.
+A thread works on columns, two at a time, and keeps these sums in registers while it runs down the rows, ``TOGETHER`` at a time: memory is
+what it waits for. Threads side by side read numbers side by side, and all of them the same few of the panel. Matrices stay in global
+memory: 1.4 MB for 140 contact nodes are too many for a block's own.
 
-Matrices are (B, n, n) arrays of which an environment uses the first ``size`` rows, a multiple of ``PANEL``. On a CPU a block is a thread.
+Matrices are (B, n, n) arrays of which an environment uses the first ``size`` rows, a multiple of ``PAIR``. On a CPU a block is a thread.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -15,16 +15,26 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.arrays import FloatArray3d
-from ipc.solver.blocks import wait_for_block
+from ipc.arrays import FloatArray2d, FloatArray3d
+from ipc.blocks import wait_for_block
 
 wp.set_module_options({"enable_backward": False})
 
 PANEL = 6
-"""Rows that are worked on together."""
+"""Rows that are factored together."""
+PAIR = 2 * PANEL
+"""Rows that are read together."""
+TOGETHER = 3
+"""Rows above that are read at once."""
 _WARP = 32
 
+vec6d = wp.types.vector(length=PANEL, dtype=wp.float64)
+
 mat62d = wp.types.matrix(shape=(PANEL, 2), dtype=wp.float64)
+mat122d = wp.types.matrix(shape=(PAIR, 2), dtype=wp.float64)
+mat32d = wp.types.matrix(shape=(TOGETHER, 2), dtype=wp.float64)
+mat36d = wp.types.matrix(shape=(TOGETHER, PANEL), dtype=wp.float64)
+mat312d = wp.types.matrix(shape=(TOGETHER, PAIR), dtype=wp.float64)
 mat66d = wp.types.matrix(shape=(PANEL, PANEL), dtype=wp.float64)
 
 
@@ -32,15 +42,53 @@ mat66d = wp.types.matrix(shape=(PANEL, PANEL), dtype=wp.float64)
 def panel_sums(
     u: FloatArray3d, y: FloatArray3d, env: wp.int32, row: wp.int32, c: wp.int32, d: wp.int32, first: wp.int32, last: wp.int32
 ) -> mat62d:
-    """Σ u[k, i] y[k, j] over ``first`` <= k < ``last``; rows i of a panel, columns j = c, d."""
+    """Σ u[k, i] y[k, j] over ``first`` <= k < ``last``; rows i of a panel, columns j = c, d.
+
+    The rows above, k, are whole panels.
+    """
     sums = mat62d()
-    for k in range(first, last):
-        a, b = y[env, k, c], y[env, k, d]
-        for i in range(PANEL):
-            v = u[env, k, row + i]
-            sums[i, 0] = sums[i, 0] + v * a
-            sums[i, 1] = sums[i, 1] + v * b
+    for top in range(first, last, TOGETHER):
+        v, w = mat36d(), mat32d()
+        for k in range(TOGETHER):
+            w[k, 0] = y[env, top + k, c]
+            w[k, 1] = y[env, top + k, d]
+            for i in range(PANEL):
+                v[k, i] = u[env, top + k, row + i]
+        for k in range(TOGETHER):
+            for i in range(PANEL):
+                for j in range(2):
+                    sums[i, j] = sums[i, j] + v[k, i] * w[k, j]
     return sums
+
+
+@wp.func
+def pair_sums(
+    u: FloatArray3d, y: FloatArray3d, env: wp.int32, row: wp.int32, c: wp.int32, d: wp.int32, first: wp.int32, last: wp.int32
+) -> mat122d:
+    """The same for rows i of two panels."""
+    sums = mat122d()
+    for top in range(first, last, TOGETHER):
+        v, w = mat312d(), mat32d()
+        for k in range(TOGETHER):
+            w[k, 0] = y[env, top + k, c]
+            w[k, 1] = y[env, top + k, d]
+            for i in range(PAIR):
+                v[k, i] = u[env, top + k, row + i]
+        for k in range(TOGETHER):
+            for i in range(PAIR):
+                for j in range(2):
+                    sums[i, j] = sums[i, j] + v[k, i] * w[k, j]
+    return sums
+
+
+@wp.func
+def panel_of(pair: mat122d, odd: wp.int32) -> mat62d:
+    """The first or, if ``odd`` is 1, the second panel of two."""
+    panel = mat62d()
+    for i in range(PANEL):
+        for j in range(2):
+            panel[i, j] = wp.where(odd == 1, pair[PANEL + i, j], pair[i, j])
+    return panel
 
 
 @wp.func
@@ -104,7 +152,13 @@ def factor(a: FloatArray3d, env: wp.int32, size: wp.int32, lane: wp.int32, lanes
         row = PANEL * p
         for c in range(row + lane, size, 2 * lanes):
             d = wp.where(c + lanes < size, c + lanes, c)
-            write_panel(read_panel(a, env, row, c, d) - panel_sums(a, a, env, row, c, d, 0, row), a, env, row, c, d)
+            if p % 2 == 0:
+                sums = pair_sums(a, a, env, row, c, d, 0, row)
+                write_panel(read_panel(a, env, row, c, d) - panel_of(sums, 0), a, env, row, c, d)
+                second = row + PANEL
+                write_panel(read_panel(a, env, second, c, d) - panel_of(sums, 1), a, env, second, c, d)
+            else:
+                write_panel(read_panel(a, env, row, c, d) - panel_sums(a, a, env, row, c, d, row - PANEL, row), a, env, row, c, d)
         wait_for_block()
         u = factored_panel(a, env, row)
         for i in range(PANEL):
@@ -132,17 +186,61 @@ def factor_block(u: FloatArray3d, env: wp.int32, row: wp.int32) -> mat66d:
 
 
 @wp.func
+def solve(u: FloatArray3d, b: FloatArray2d, y: FloatArray2d, env: wp.int32, size: wp.int32, lane: wp.int32, lanes: wp.int32):
+    """b becomes (Uᵀ U)⁻¹ b, and y U⁻ᵀ b."""
+    for p in range(size / PANEL):
+        row = PANEL * p
+        block, x = factor_block(u, env, row), vec6d()
+        for i in range(PANEL):
+            total = b[env, row + i]
+            for k in range(i):
+                total -= block[k, i] * x[k]
+            x[i] = block[i, i] * total
+        for c in range(row + PANEL + lane, size, lanes):
+            total = b[env, c]
+            for i in range(PANEL):
+                total -= u[env, row + i, c] * x[i]
+            b[env, c] = total
+        if lane == 0:
+            for i in range(PANEL):
+                y[env, row + i] = x[i]
+        wait_for_block()
+    for p in range(size / PANEL):
+        row = size - PANEL * (p + 1)
+        block, x = factor_block(u, env, row), vec6d()
+        for j in range(PANEL):
+            i = PANEL - 1 - j
+            total = y[env, row + i]
+            for k in range(i + 1, PANEL):
+                total -= block[i, k] * x[k]
+            x[i] = block[i, i] * total
+        for r in range(lane, row, lanes):
+            total = y[env, r]
+            for i in range(PANEL):
+                total -= u[env, r, row + i] * x[i]
+            y[env, r] = total
+        if lane == 0:
+            for i in range(PANEL):
+                b[env, row + i] = x[i]
+        wait_for_block()
+
+
+@wp.func
 def solve_identity(u: FloatArray3d, y: FloatArray3d, env: wp.int32, size: wp.int32, lane: wp.int32, lanes: wp.int32):
     """y = U⁻ᵀ, zero above its diagonal."""
     one = wp.float64(1.0)
     for c in range(lane, size, 2 * lanes):
         d = wp.where(c + lanes < size, c + lanes, c)
-        first = c - c % PANEL
+        first, sums = c - c % PANEL, mat122d()
         for p in range(size / PANEL):
             row = PANEL * p
             x = mat62d()
             if row >= first:
-                x = -panel_sums(u, y, env, row, c, d, first, row)
+                if p % 2 == 0:
+                    sums = pair_sums(u, y, env, row, c, d, first, row)
+                    x = -panel_of(sums, 0)
+                else:
+                    x = -panel_of(sums, 1) - panel_sums(u, y, env, row, c, d, wp.max(first, row - PANEL), row)
                 for i in range(PANEL):
                     if row + i == c:
                         x[i, 0] = x[i, 0] + one
@@ -162,14 +260,14 @@ def gram(y: FloatArray3d, out: FloatArray3d, env: wp.int32, size: wp.int32, lane
     width = wp.min(_WARP, lanes)
     groups, group = lanes / width, lane / width
     task = wp.int32(0)
-    for p in range(size / PANEL):
-        row = PANEL * p
+    for p in range(size / PAIR):
+        row = PAIR * p
         for start in range(row, size, 2 * width):
             c = start + lane % width
             if task % groups == group and c < size:
                 d = wp.where(c + width < size, c + width, c)
-                x = panel_sums(y, y, env, row, c, d, c - c % PANEL, size)
-                for i in range(PANEL):
+                x = pair_sums(y, y, env, row, c, d, c - c % PANEL, size)
+                for i in range(PAIR):
                     if c >= row + i:
                         out[env, row + i, c] = x[i, 0]
                         out[env, c, row + i] = x[i, 0]

@@ -6,10 +6,9 @@ A = L Lᵀ is factored in each Newton iteration. By Woodbury's identity
 
     (K_0 + Jᵀ S J)⁻¹ = C − C Jᵀ W J C,      W = (S⁻¹ + J C Jᵀ)⁻¹ = K − K (K + S)⁻¹ K,      K = (J C Jᵀ)⁻¹.
 
-The second form needs no inverse of S, which is not regular where friction is missing. Affine bodies have unknowns Lᵀ x and rows L⁻¹ q here
-(``affine_factor.py``), for which K = 1. Inverses are computed in double precision by one block of threads an environment (``dense.py``).
-W itself is not: it is needed for few products in a Newton iteration, and three matrices times a vector have less arithmetic than a product
-of matrices.
+The second form needs no inverse of S, which is not regular where friction is missing. K stays while the contact nodes do, and is inverted;
+K + S changes in each Newton iteration, for few products, and is only factored. Both in double precision by one block of threads an
+environment (``dense.py``). Affine bodies have unknowns Lᵀ x and rows L⁻¹ q here (``affine_factor.py``), for which K = 1.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -19,10 +18,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from ipc.arrays import FloatArray2d, IntArray, MatArray2d, SingleArray3d, VecArray2d
+from ipc.arrays import FloatArray2d, FloatArray3d, IntArray, MatArray2d, SingleArray3d, VecArray2d
+from ipc.blocks import wait_for_block
 from ipc.contact.contacts import Contacts, mat34d, rows_of
 from ipc.solver.affine_elimination import Elimination, finish_elimination
-from ipc.solver.blocks import wait_for_block
 from ipc.solver.linear import SystemView, row_column
 from ipc.solver.preconditioners.affine_factor import factor_affine, scaled_row
 from ipc.solver.preconditioners.contact_nodes import (
@@ -36,7 +35,7 @@ from ipc.solver.preconditioners.contact_nodes import (
     rest_entry,
     slot_of,
 )
-from ipc.solver.preconditioners.dense import PANEL, invert
+from ipc.solver.preconditioners.dense import PAIR, PANEL, factor, invert, read_panel, solve, vec6d
 
 wp.set_module_options({"enable_backward": False})
 
@@ -44,6 +43,8 @@ LANES = 256
 """Threads on CUDA for the small system of an environment; the size of all blocks."""
 _APART = 64
 """Threads a body, of which one works: few then share a cache, since registers do not do."""
+_BODY_THREADS = 1024
+"""Threads on CUDA that add up the rows of a body."""
 _ENTRIES = 78
 """Of the upper half of a body's 12 × 12 matrix."""
 
@@ -98,10 +99,10 @@ def add_rows(contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32, 
 
 
 @wp.kernel
-def add_bodies(contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
-    """S += the upper half of Σ g gᵀ of each affine body's rows, one block of threads a body.
+def add_bodies(contacts: Contacts, rows_g: FloatArray3d, rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
+    """S += the upper half of Σ g gᵀ of each affine body's rows.
 
-    Nearly all rows belong to a body: its twelve unknowns are added up by entries of S, and not by rows, which would all meet there.
+    ``rows_g`` (B, rows, 12) has the numbers of their g. Nearly all rows belong to a body: its twelve unknowns are added up by entries of S, and not by rows, which would all meet there.
     """
     env, body, lane = wp.tid()
     if active[env] == 0 or not fits(small, env):
@@ -119,23 +120,47 @@ def add_bodies(contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32
             j -= 12 - i
             i += 1
         j += i
+        a, b = 4 * (i % 3) + i / 3, 4 * (j % 3) + j / 3
         total = wp.float64(0.0)
         for r in range(part, rows, parts):
             if contacts.row_body[env, r] == first and contacts.concave[env, r] == 0:
-                g = contacts.scaled_row[env, r]
-                total += g[i % 3, i / 3] * g[j % 3, j / 3]
+                total += rows_g[env, r, a] * rows_g[env, r, b]
         wp.atomic_add(small.s, env, place + i, place + j, total)
 
 
 @wp.func
 def padded_size(nodes: wp.int32) -> wp.int32:
-    """Unknowns of contact nodes, and up to the next multiple of ``PANEL``."""
-    return PANEL * ((3 * nodes + PANEL - 1) / PANEL)
+    """Unknowns of contact nodes, and up to the next multiple of ``PAIR``."""
+    return PAIR * ((3 * nodes + PAIR - 1) / PAIR)
 
 
 @wp.func
-def find_stiffness(rest: Rest, small: Small, env: wp.int32, lane: wp.int32, lanes: wp.int32) -> wp.bool:
-    """K = (J C Jᵀ)⁻¹ of the pads' contact nodes; False where a pivot is not positive."""
+def forget_rows(small: Small, env: wp.int32, lane: wp.int32, lanes: wp.int32):
+    """S = 0, for the next S."""
+    size = padded_size(small.count[env])
+    for e in range(lane, size * size, lanes):
+        small.s[env, e / size, e % size] = wp.float64(0.0)
+
+
+@wp.func
+def give_up(small: Small, env: wp.int32, lane: wp.int32, lanes: wp.int32):
+    """Do without contacts, which is still a preconditioner: something is not finite."""
+    forget_rows(small, env, lane, lanes)
+    wait_for_block()
+    if lane == 0:
+        small.count[env] = 0
+        small.known[env] = -1
+
+
+@wp.kernel(launch_bounds=(LANES, 1))
+def find_stiffness(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
+    """K = (J C Jᵀ)⁻¹ where the pads' contact nodes have changed.
+
+    One block of threads an environment.
+    """
+    env, lane = wp.tid()
+    if active[env] == 0 or not fits(small, env) or small.known[env] == small.pads[env]:
+        return
     n = 3 * small.pads[env]
     size = padded_size(small.pads[env])
     for e in range(lane, size * size, lanes):
@@ -150,45 +175,34 @@ def find_stiffness(rest: Rest, small: Small, env: wp.int32, lane: wp.int32, lane
             if rest.part[a] == rest.part[b]:
                 value = wp.float64(rest_entry(rest, rest.part[a], rest.unknown[a] + i % 3, rest.unknown[b] + j % 3))
         small.k[env, i, j] = value
-    return invert(small.k, small.inverse, env, size, lane, lanes)
+    if invert(small.k, small.factor, env, size, lane, lanes):
+        if lane == 0:
+            small.known[env] = small.pads[env]
+    else:
+        give_up(small, env, lane, lanes)
 
 
-@wp.kernel(launch_bounds=(LANES, 2))
-def invert_small(rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
-    """(K + S)⁻¹, one block of threads an environment.
-
-    It leaves ``s`` zero for the next S.
-    """
+@wp.kernel(launch_bounds=(LANES, 1))
+def factor_contacts(active: IntArray, lanes: wp.int32, small: Small):
+    """K + S = Uᵀ U, one block of threads an environment."""
     env, lane = wp.tid()
     if active[env] == 0 or not fits(small, env):
         return
     size, pads = padded_size(small.count[env]), 3 * small.pads[env]
-    good = wp.bool(True)
-    if small.known[env] != small.pads[env]:
-        good = find_stiffness(rest, small, env, lane, lanes)
-    wait_for_block()
-    if good:
-        if lane == 0:
-            small.known[env] = small.pads[env]
-        for e in range(lane, size * size, lanes):
-            i = e / size
-            j = e - size * i
-            if i <= j:
-                value = small.s[env, i, j]
-                if j < pads:
-                    value += small.k[env, i, j]
-                elif i == j:
-                    value += wp.float64(1.0)
-                small.inverse[env, i, j] = value
-        good = invert(small.inverse, small.s, env, size, lane, lanes)
-    if not good:
-        # Something is not finite: without contacts it is still a preconditioner.
-        wait_for_block()
-        if lane == 0:
-            small.count[env] = 0
-            small.known[env] = -1
     for e in range(lane, size * size, lanes):
-        small.s[env, e / size, e % size] = wp.float64(0.0)
+        i = e / size
+        j = e - size * i
+        if i <= j:
+            value = small.s[env, i, j]
+            if j < pads:
+                value += small.k[env, i, j]
+            elif i == j:
+                value += wp.float64(1.0)
+            small.factor[env, i, j] = value
+    if factor(small.factor, env, size, lane, lanes):
+        forget_rows(small, env, lane, lanes)
+    else:
+        give_up(small, env, lane, lanes)
 
 
 @wp.func
@@ -200,15 +214,33 @@ def sum_of_parts(y: SingleArray3d, place: wp.int32, u: wp.int32) -> wp.float32:
 
 
 @wp.func
-def stiffness_row(small: Small, env: wp.int32, i: wp.int32, x: FloatArray2d) -> wp.float64:
-    """(K x)_i; K is 1 for affine bodies."""
-    pads = 3 * small.pads[env]
-    if i >= pads:
-        return x[env, i]
-    total = wp.float64(0.0)
-    for j in range(pads):
-        total += small.k[env, j, i] * x[env, j]
+def column_sums(a: FloatArray3d, x: FloatArray2d, env: wp.int32, c: wp.int32, d: wp.int32, size: wp.int32) -> wp.vec2d:
+    """Σ_k a[k, j] x[k] of two columns j = c, d over ``size`` rows, whole panels.
+
+    A panel's numbers are read at once, since memory is what is waited for.
+    """
+    total = wp.vec2d()
+    for row in range(0, size, PANEL):
+        v, w = read_panel(a, env, row, c, d), vec6d()
+        for k in range(PANEL):
+            w[k] = x[env, row + k]
+        for k in range(PANEL):
+            for j in range(2):
+                total[j] = total[j] + v[k, j] * w[k]
     return total
+
+
+@wp.func
+def stiffness_rows(small: Small, env: wp.int32, c: wp.int32, d: wp.int32, x: FloatArray2d) -> wp.vec2d:
+    """Rows c < d, or c = d, of K x; K is 1 for affine bodies."""
+    pads = 3 * small.pads[env]
+    rows = wp.vec2d(x[env, c], x[env, d])
+    if c < pads:
+        total = column_sums(small.k, x, env, c, d, padded_size(small.pads[env]))
+        rows[0] = total[0]
+        if d < pads:
+            rows[1] = total[1]
+    return rows
 
 
 @wp.kernel
@@ -229,18 +261,27 @@ def contact_forces(
             small.t[env, i] = z[env, node][i % 3]
         else:
             small.t[env, i] = wp.float64(sum_of_parts(y, place[env], rest.unknown[node] + i % 3))
+    size = padded_size(small.count[env])
+    for i in range(n + lane, size, lanes):
+        small.t[env, i] = wp.float64(0.0)
+        small.force[env, i] = wp.float64(0.0)
     wait_for_block()
-    for i in range(lane, n, lanes):
-        small.force[env, i] = stiffness_row(small, env, i, small.t)
+    for c in range(lane, n, 2 * lanes):
+        d = wp.where(c + lanes < n, c + lanes, c)
+        rows = stiffness_rows(small, env, c, d, small.t)
+        small.force[env, c] = rows[0]
+        small.force[env, d] = rows[1]
     wait_for_block()
-    for i in range(lane, n, lanes):
-        total = wp.float64(0.0)
-        for j in range(n):
-            total += small.inverse[env, j, i] * small.force[env, j]
-        small.t[env, i] = total
+    for i in range(lane, size, lanes):
+        small.t[env, i] = small.force[env, i]
     wait_for_block()
-    for i in range(lane, n, lanes):
-        small.force[env, i] = small.force[env, i] - stiffness_row(small, env, i, small.t)
+    solve(small.factor, small.t, small.half, env, size, lane, lanes)
+    for c in range(lane, n, 2 * lanes):
+        d = wp.where(c + lanes < n, c + lanes, c)
+        rows = stiffness_rows(small, env, c, d, small.t)
+        first, second = small.force[env, c] - rows[0], small.force[env, d] - rows[1]
+        small.force[env, c] = first
+        small.force[env, d] = second
 
 
 @wp.kernel
@@ -253,9 +294,14 @@ def eliminate_where_full(
         finish_elimination(e, inverse, env, lane, threads, r, z)
 
 
-def even(room: int) -> int:
-    """Contact nodes whose unknowns fill whole panels."""
-    return room + room % 2
+def whole_pairs(room: int) -> int:
+    """Contact nodes, at least ``room``, whose unknowns fill whole pairs of panels."""
+    return room + -room % (PAIR // 3)
+
+
+def _numbers(rows: wp.array) -> wp.array:
+    """The twelve numbers of each matrix, (B, rows, 12), in the same memory."""
+    return wp.array(ptr=rows.ptr, dtype=wp.float64, shape=(*rows.shape, 12), device=rows.device)
 
 
 class LowRank:
@@ -270,7 +316,7 @@ class LowRank:
         self.rest, self.batch, self.row_lanes, self.device = rest, batch, row_lanes, device
         self.lanes = LANES if device.is_cuda else 1
         nodes = max(1, len(rest.surface_node))
-        room = even(max(1, min(room, nodes)))
+        room = whole_pairs(max(1, min(room, nodes)))
 
         def zeros(*shape: int, dtype: type = wp.float32) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device)
@@ -280,8 +326,8 @@ class LowRank:
         small.count, small.pads = zeros(batch, dtype=wp.int32), zeros(batch, dtype=wp.int32)
         small.node = zeros(batch, room, dtype=wp.int32)
         small.known = wp.full(batch, -1, dtype=wp.int32, device=device)
-        small.s, small.k, small.inverse = (zeros(batch, 3 * room, 3 * room, dtype=wp.float64) for _ in range(3))
-        small.t, small.force = zeros(batch, 3 * room, dtype=wp.float64), zeros(batch, 3 * room, dtype=wp.float64)
+        small.s, small.k, small.factor = (zeros(batch, 3 * room, 3 * room, dtype=wp.float64) for _ in range(3))
+        small.t, small.half, small.force = (zeros(batch, 3 * room, dtype=wp.float64) for _ in range(3))
         self.bodies = len(rest.affine_node) // 4
         small.root = zeros(batch, 4 * self.bodies, 4, dtype=wp.mat33d)
         self.small, self.full = small, zeros(batch, dtype=wp.int32)
@@ -308,9 +354,11 @@ class LowRank:
         if rows:
             self._launch(add_rows, (self.batch, self.row_lanes), [contacts, rest, active, self.row_lanes, small])
             if self.bodies:
-                inputs = [contacts, rest, active, self.lanes, small]
-                self._launch(add_bodies, (self.batch, self.bodies, self.lanes), inputs, self.lanes)
-            self._launch(invert_small, (self.batch, self.lanes), [rest, active, self.lanes, small], self.lanes)
+                threads = _BODY_THREADS if self.device.is_cuda else 1
+                inputs = [contacts, _numbers(contacts.scaled_row), rest, active, threads, small]
+                self._launch(add_bodies, (self.batch, self.bodies, threads), inputs)
+            self._launch(find_stiffness, (self.batch, self.lanes), [rest, active, self.lanes, small], self.lanes)
+            self._launch(factor_contacts, (self.batch, self.lanes), [active, self.lanes, small], self.lanes)
 
     def find_forces(self, y: wp.array, z: wp.array, running: wp.array, place: wp.array) -> None:
         """Compute ``small.force`` = W t for the running environments.

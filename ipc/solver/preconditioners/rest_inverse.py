@@ -17,12 +17,12 @@ import numpy as np
 import warp as wp
 
 from ipc.arrays import IntArray, MatArray2d, SingleArray2d, SingleArray3d, VecArray2d, filled
+from ipc.blocks import THREADS as BLOCK_THREADS
 from ipc.bodies.layout import Layout
 from ipc.contact.contacts import Contacts
 from ipc.settings import Settings
 from ipc.solver.affine_elimination import affine_nodes
 from ipc.solver.block_jacobi import BlockJacobi
-from ipc.solver.blocks import THREADS as BLOCK_THREADS
 from ipc.solver.linear import SystemView
 from ipc.solver.preconditioners.affine_factor import affine_motion, scaled_force
 from ipc.solver.preconditioners.contact_nodes import Rest, Small, fits, rest_entry
@@ -34,8 +34,13 @@ wp.set_module_options({"enable_backward": False})
 
 TILE_ENVS, TILE_OUT, TILE_IN = 32, 64, 32
 """Tile of the product of matrices: environments × outputs, inputs summed at a time."""
+TILES = 1000
+"""Tiles of a product that are computed at the same time; few alone wait for memory."""
 TILED_FROM = 8
 """Number of environments from which tiles are used instead of products with vectors."""
+_TOGETHER = 4
+vec4i = wp.types.vector(length=_TOGETHER, dtype=wp.int32)
+mat43 = wp.types.matrix(shape=(_TOGETHER, 3), dtype=wp.float32)
 THREADS = 200_000
 """Threads of a product with vectors; a GPU needs many to read memory at its full rate."""
 MAX_CONTACTS = 200
@@ -89,20 +94,25 @@ def place_running(running: IntArray, place: IntArray, total_running: IntArray):
 
 @wp.kernel
 def multiply_tiles(
-    matrix: SingleArray3d, x: SingleArray2d, x_first: wp.int32, y_first: wp.int32, total_running: IntArray, y: SingleArray2d
+    matrix: SingleArray3d, x: SingleArray2d, x_first: wp.int32, y_first: wp.int32, total_running: IntArray, y: SingleArray3d
 ):
-    """y = x · matrix in tiles, patch by patch, of the environments that run, which come first."""
-    patch, i, j = wp.tid()
+    """y = x · matrix in tiles, patch by patch, with a sum y[c] for each part of the inputs.
+
+    Of the environments that run, which come first.
+    """
+    both, i, j = wp.tid()
+    part, patch = both / matrix.shape[0], both % matrix.shape[0]
     if i * TILE_ENVS >= total_running[0]:
         return
     inputs, outputs = matrix.shape[1], matrix.shape[2]
-    block = matrix[patch]
+    block, steps = matrix[patch], inputs / TILE_IN
+    length = (steps + y.shape[0] - 1) / y.shape[0]
     total = wp.tile_zeros(shape=(TILE_ENVS, TILE_OUT), dtype=wp.float32)
-    for k in range(inputs / TILE_IN):
+    for k in range(part * length, wp.min((part + 1) * length, steps)):
         a = wp.tile_load(x, shape=(TILE_ENVS, TILE_IN), offset=(i * TILE_ENVS, x_first + patch * inputs + k * TILE_IN))
         b = wp.tile_load(block, shape=(TILE_IN, TILE_OUT), offset=(k * TILE_IN, j * TILE_OUT))
         wp.tile_matmul(a, b, total)
-    wp.tile_store(y, total, offset=(i * TILE_ENVS, y_first + patch * outputs + j * TILE_OUT))
+    wp.tile_store(y[part], total, offset=(i * TILE_ENVS, y_first + patch * outputs + j * TILE_OUT))
 
 
 class Product:
@@ -132,9 +142,9 @@ class Product:
                 y = self.y_whole.numpy()[:, self.y_first + p * outputs :][:, :outputs]
                 np.matmul(x, self.matrix.numpy()[p], out=y)
         elif tiled(self.batch, device):
-            dim = (patches, self.x.shape[0] // TILE_ENVS, outputs // TILE_OUT)
+            dim = (self.y.shape[0] * patches, self.x.shape[0] // TILE_ENVS, outputs // TILE_OUT)
             inputs = [*common, self.total_running]
-            wp.launch_tiled(multiply_tiles, dim=dim, inputs=inputs, outputs=[self.y_whole], block_dim=LANES, device=device)
+            wp.launch_tiled(multiply_tiles, dim=dim, inputs=inputs, outputs=[self.y], block_dim=LANES, device=device)
         else:
             parts = self.y.shape[0]
             inputs_of = [*common, -(-inputs // parts), running]
@@ -226,7 +236,7 @@ def scatter_interface(
 ):
     """x_Γ = S⁻¹ g − S⁻¹ Jᵀ W J S⁻¹ g, with a copy for every patch that borders on the node.
 
-    x of affine bodies.
+    x of affine bodies. Some contact nodes are read at once, since memory is what is waited for.
     """
     env, i = wp.tid()
     if running[env] == 0 or not fits(small, env):
@@ -239,14 +249,20 @@ def scatter_interface(
         return
     part, at = rest.part[i], place[env]
     value = wp.vec3(sum_of_parts(y, at, u), sum_of_parts(y, at, u + 1), sum_of_parts(y, at, u + 2))
-    for k in range(small.count[env]):
-        node = small.node[env, k]
-        if rest.part[node] == part:
-            v = rest.unknown[node]
+    pads = small.pads[env]
+    for first in range(0, pads, _TOGETHER):
+        unknowns, forces = vec4i(), mat43()
+        for j in range(_TOGETHER):
+            k = wp.min(first + j, pads - 1)
+            node = small.node[env, k]
+            same = rest.part[node] == part and first + j < pads
+            unknowns[j] = wp.where(same, rest.unknown[node], u)
             for c in range(3):
-                f = wp.float32(small.force[env, 3 * k + c])
+                forces[j, c] = wp.where(same, wp.float32(small.force[env, 3 * k + c]), wp.float32(0.0))
+        for j in range(_TOGETHER):
+            for c in range(3):
                 for d in range(3):
-                    value[d] = value[d] - f * rest_entry(rest, part, v + c, u + d)
+                    value[d] = value[d] - forces[j, c] * rest_entry(rest, part, unknowns[j] + c, u + d)
     z[env, i] = wp.vec3d(wp.float64(value[0]), wp.float64(value[1]), wp.float64(value[2]))
     for k in range(inside.twin_start[i], inside.twin_start[i + 1]):
         for d in range(3):
@@ -353,6 +369,7 @@ class RestInverse:
         parts, rows = 1, self.batch
         if tiled(self.batch, self.device):
             rows = -(-rows // TILE_ENVS) * TILE_ENVS
+            parts = int(np.clip(TILES * TILE_ENVS * TILE_OUT // max(1, rows * outputs), 1, 8))
         elif self.device.is_cuda:
             parts = int(np.clip(THREADS // max(1, rows * outputs), 1, 64))
         x, y = (rows, inputs), (parts, rows, outputs)

@@ -56,7 +56,7 @@ class ReferenceIntegrator:
         def radiance(sampler: Any, ray: Any) -> list[Any]:
             return trace(self.scene.mi, self.scene, sampler, ray, lamps, groups, self.max_depth)
 
-        return accumulate(self.scene.mi, self.camera, radiance, spp, seed, self.progress)
+        return accumulate(self.scene, self.camera, radiance, spp, seed, self.progress)
 
 
 class StockPathIntegrator(ReferenceIntegrator):
@@ -75,15 +75,20 @@ class StockPathIntegrator(ReferenceIntegrator):
 
         for group in range(max(groups) + 1):
             self.scene.set_layers([name for name, g in zip(names, groups, strict=True) if g == group])
-            layers.append(accumulate(self.scene.mi, self.camera, radiance, spp, seed, self.progress)[0])
+            layers.append(accumulate(self.scene, self.camera, radiance, spp, seed, self.progress)[0])
         return np.stack(layers)
 
 
 def accumulate(
-    mi: Any, camera: Pinhole, radiance: Callable[[Any, Any], list[Any]], spp: int, seed: int, progress: bool
+    scene: SensorScene, camera: Pinhole, radiance: Callable[[Any, Any], list[Any]], spp: int, seed: int, progress: bool
 ) -> np.ndarray:
-    """Mean of ``radiance(sampler, ray)`` over ``spp`` rays a pixel; (G, H, W, 3), float32."""
-    width, height = camera.resolution
+    """Mean of ``radiance(sampler, ray)`` over ``spp`` rays a pixel; (G, H, W, 3), float32.
+
+    Rays begin at the pinhole, or at the case's floor if that lies before it.
+    """
+    mi, (width, height) = scene.mi, camera.resolution
+    behind = scene.sensor.case.floor_z - camera.position[2]
+    start = UNIT * behind + OFFSET if behind > 0 else 0.0
     per_launch = max(1, min(spp, LAUNCH // (width * height)))
     template = mi.load_dict({"type": "independent"})
     total, done = np.zeros(()), 0
@@ -96,7 +101,8 @@ def accumulate(
             pixel = dr.arange(mi.UInt32, n) // count
             jitter = sampler.next_2d()
             tx, ty = camera.slope(mi.Float(pixel % width) + jitter.x, mi.Float(pixel // width) + jitter.y)
-            ray = mi.Ray3f(mi.Point3f([UNIT * c for c in camera.position]), dr.normalize(mi.Vector3f(tx, ty, 1)))
+            d = mi.Vector3f(tx, ty, 1)
+            ray = mi.Ray3f(mi.Point3f([UNIT * c for c in camera.position]) + start * d, dr.normalize(d))
             channels = radiance(sampler, ray)
             # All in one kernel: each sum would otherwise evaluate its own channel, and with it trace every path again.
             dr.eval(channels)

@@ -123,8 +123,9 @@ def find_centres(
 def lose_heights(height: wp.array3d(dtype=wp.float32), sound: wp.array(dtype=wp.int32)):
     """0 in environments in which a height is not finite, by (environment, row)."""
     env, row = wp.tid()
+    line = height[env, row]
     for i in range(height.shape[2]):
-        if not wp.isfinite(height[env, row, i]):
+        if not wp.isfinite(line[i]):
             sound[env] = 0
 
 

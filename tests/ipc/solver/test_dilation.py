@@ -10,7 +10,8 @@ import warp as wp
 
 import ipc
 from ipc.bodies import build_layout
-from ipc.solver import pcg
+from ipc.solver import newton, pcg
+from ipc.solver.dilation import dilation_rows
 from ipc.solver.linear import find_volume_motions, multiply_blocks
 from ipc.solver.potential import Potential
 from ipc.solver.preconditioners.rest_stiffness import couplings, rest_blocks
@@ -265,6 +266,8 @@ def test_cuda_agrees_with_the_cpu() -> None:
 
 
 def test_the_general_conjugate_gradients_are_those_of_one_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the whole matrix, as on CUDA."""
+    monkeypatch.setattr(newton, "_is_held", lambda layout: False)
     ends = []
     for general in (False, True):
         if general:
@@ -274,6 +277,20 @@ def test_the_general_conjugate_gradients_are_those_of_one_kernel(monkeypatch: py
         ends.append((world.positions("pad"), reports[-1].linear))
     assert (ends[0][1] > 0).all() and np.abs(ends[0][1] - ends[1][1]).max() <= 1
     assert np.abs(ends[0][0] - ends[1][0]).max() < 1e-12
+
+
+def test_rows_block_by_block_are_those_gathered_by_pairs(rng: np.random.Generator) -> None:
+    """The form of a CPU and that of CUDA."""
+    solver = blocked_cube()
+    gradient_at(solver, solver.layout.node_rest + 0.1 * rng.standard_normal(solver.layout.node_rest.shape))
+    solver.fill_matrix(solver.everyone)
+    rows = solver.system.volume_row.numpy().copy()
+    solver.system.volume_row.zero_()
+    inputs = [solver.elements, solver.volumes, solver.el_F, solver.everyone]
+    solver.launch(dilation_rows, rows.shape, inputs, [solver.system.volume_row])
+    gathered = solver.system.volume_row.numpy()
+    assert np.abs(gathered).min(axis=2).max() > 0
+    np.testing.assert_allclose(rows, gathered, rtol=0, atol=1e-14 * np.abs(gathered).max())
 
 
 def test_the_rest_inverse_knows_the_blocks() -> None:

@@ -12,7 +12,7 @@ import ipc
 from ipc.bodies import build_layout
 from ipc.solver import elasticity
 from ipc.solver.potential import Potential
-from tests.ipc.conftest import unit_cell
+from tests.ipc.conftest import bonded_pad, small_pad, unit_cell
 
 Model = Literal["stable", "stable_log"]
 
@@ -67,6 +67,7 @@ def gradient_at(solver: Potential, y: np.ndarray, project: bool = False) -> np.n
 def energy_change(solver: Potential, y0: np.ndarray, y1: np.ndarray) -> float:
     for array, y in ((solver.y, y0), (solver.y1, y1)):
         array.assign(y[None])
+    solver.evaluate_elements(solver.everyone)
     solver.elastic_change(solver.everyone, wp.full(1, np.inf, dtype=wp.float64, device="cpu"))
     return float(solver.el_change.numpy().sum())
 
@@ -222,3 +223,28 @@ def test_bad_materials_are_refused() -> None:
         ipc.Material(1e5, 0.5)
     with pytest.raises(ipc.IpcError, match="young"):
         ipc.Material(-1.0)
+
+
+def test_blocks_are_used_again_until_an_element_deforms(rng: np.random.Generator) -> None:
+    """After small motions the blocks stay; after a large one, another projection or at a new step they are new."""
+    world = ipc.World([bonded_pad(small_pad())], ipc.Settings(dt=0.01, preconditioner="block_jacobi"), device="cpu")
+    pot = world._newton.potential
+    pot.place_vertices(pot.y, pot.R, pot.t, pot.x)
+    free = world.layout.node_free[None, :, None]
+    start, upper, edge = pot.y.numpy().copy(), pot.upper.numpy()[:, 1], world.layout.min_edge
+
+    def blocks(share: float, *, anew: bool = False) -> np.ndarray:
+        pot.y.assign(start + share * edge * free * motion)
+        if anew:
+            pot.forget_matrix()
+        pot.assemble(pot.everyone)
+        pot.fill_matrix(pot.everyone)
+        return pot.system.blocks.numpy()[0, upper].copy()
+
+    motion = rng.uniform(-1.0, 1.0, size=start.shape)
+    first = blocks(0.0)
+    assert np.array_equal(blocks(1e-4), first) and not np.array_equal(blocks(1e-4, anew=True), first)
+    assert np.array_equal(blocks(0.1), blocks(0.1, anew=True))
+    definite = blocks(0.3)
+    pot.project.fill_(1)
+    assert not np.array_equal(blocks(0.3), definite)

@@ -12,7 +12,7 @@ import pytest
 import warp as wp
 
 import ipc
-from ipc.arrays import FloatArray, VecArray2d
+from ipc.arrays import FloatArray, Vec4Array2d
 from ipc.contact.contacts import Contacts
 from ipc.reduce import BLOCK
 from ipc.solver.halves import multiply_half
@@ -105,10 +105,12 @@ def whole_product(pot: Potential, p: np.ndarray) -> np.ndarray:
 
 def half_product(pot: Potential, p: np.ndarray) -> tuple[np.ndarray, float]:
     """H p by the upper half, and p·H p."""
-    x, out = (wp.array(a.reshape(1, -1, 3), dtype=wp.vec3d, device="cpu") for a in (p, np.zeros_like(p)))
+    padded = np.pad(p.reshape(1, -1, 3), ((0, 0), (0, 0), (0, 1)))
+    x, out = (wp.array(a, dtype=wp.vec4d, device="cpu") for a in (padded, np.zeros_like(padded)))
     total = wp.zeros(1, dtype=wp.float64, device="cpu")
     wp.launch(multiply_by_half, dim=1, inputs=[pot.system, pot.collision.contacts, x, out, total], device="cpu")
-    return out.numpy().ravel(), float(total.numpy()[0])
+    assert not out.numpy()[..., 3].any()
+    return out.numpy()[..., :3].ravel(), float(total.numpy()[0])
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -122,7 +124,7 @@ def test_products_are_those_of_the_rows(device: str, rng: np.random.Generator) -
 
 
 @wp.kernel
-def multiply_by_half(system: SystemView, contacts: Contacts, p: VecArray2d, out: VecArray2d, total: FloatArray):
+def multiply_by_half(system: SystemView, contacts: Contacts, p: Vec4Array2d, out: Vec4Array2d, total: FloatArray):
     env = wp.tid()
     total[env] = multiply_half(system, contacts, env, p, out)
 

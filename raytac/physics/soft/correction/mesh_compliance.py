@@ -44,7 +44,7 @@ def correction_compliances(mesh: PadMesh, gelpad: GelpadSpec) -> tuple[np.ndarra
         if size > _MOST_BYTES:
             return made
         while size + sum(array.nbytes for pair in _kept.values() for array in pair) > _MOST_BYTES:
-            del _kept[next(iter(_kept))]
+            _kept.pop(next(iter(_kept)))
         _kept[key] = made
     return _kept[key]
 

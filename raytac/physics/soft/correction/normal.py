@@ -14,6 +14,7 @@ from raytac.physics.soft.clearance import hat_arrays
 from raytac.physics.soft.coat_surface import CoatSurface
 from raytac.physics.soft.correction import normal_kernels as kernels
 from raytac.physics.soft.correction.cosine_series import CosineSeries, nodal_compliance
+from raytac.physics.soft.correction.plane_waves import CosineSum
 from raytac.physics.soft.correction.vertex_forces import VertexForces
 from raytac.physics.soft.settings import Correction
 from raytac.specs.sensor import GelpadSpec
@@ -101,7 +102,7 @@ class NormalCorrection:
         self._layer, self._table = constant(layer), self._distances(layer, nx)
         self._analysis = constant(self.series_y.analysis), constant(self.series_x.analysis.T)
         self._across = constant(self.series_y.analysis.T), constant(self.series_y.synthesis(grid.y).T)
-        self._synthesis_x = constant(self.series_x.synthesis(grid.x).T)
+        self._synthesis = CosineSum((self.series_x, self.series_y), grid.x, grid.y, products)
         self._sides = constant((compliance - continued).T)
         area_x, area_y = (_lengths(line) for line in (grid.x, grid.y))
         self._force_y = constant(hat_matrix(mesh.lines_y, grid.y).T * area_y)
@@ -110,7 +111,7 @@ class NormalCorrection:
         self._border, self._border_x = (constant(border_y.T), constant(border_x)), constant(border_x.T)
         zeros, (rows, columns) = products.zeros, mesh.shape
         self._along_y, self._convolved, self._dent = zeros(nx, ny), zeros(nx, ny), zeros(nx, ny)
-        self._dented, self.dent = zeros(ny, nx), zeros(ny, nx)
+        self.dent = zeros(ny, nx)
         self._over_x, self._over_vertices, self._border_y = zeros(ny, columns), zeros(rows, columns), zeros(columns, ny)
         self._border_at = zeros(columns, rows)
         self.hats = hat_arrays(mesh, grid.x, grid.y, device)
@@ -220,10 +221,7 @@ class NormalCorrection:
         s, multiply, active = self.search, self.products.multiply, self.search.touched
         multiply(self._analysis[0], self.pressure, self._half, inner=s.rows, columns=s.columns, active=active)
         multiply(self._half, self._analysis[1], self.waves, inner=s.columns, active=active)
-        fields = [active, self._layer.numbers, self.waves.numbers, self._dented.numbers]
-        self._launch(kernels.scale, (len(active), self.waves.shape[0]), fields)
-        multiply(self._across[1].transposed, self._dented, self._half, active=active)
-        multiply(self._half, self._synthesis_x, self.dent, active=active)
+        self._synthesis.find(self._layer, self.waves, active, self.dent)
         self._find_border(self.pressure, active)
         multiply(self._border_at, self._border[0], self._border_y, active=active)
         multiply(self._border_y.transposed, self._border_x, self.dent, active=active, adds=True)

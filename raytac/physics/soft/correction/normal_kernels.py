@@ -21,6 +21,7 @@ from raytac.physics.soft.correction.force_kernels import Unknowns
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 _0 = wp.constant(wp.float64(0.0))
+_INF = wp.constant(wp.float64(wp.inf))
 _ZERO = wp.constant(wp.float32(0.0))
 _HUGE = wp.constant(wp.float64(1e300))
 
@@ -120,12 +121,13 @@ def overlaps(
     """
     env, row = wp.tid()
     from_, to = rise.shape[2], wp.int32(0)
+    above, at_rest, risen, overlapped = under[env, row], rest[row], rise[env, row], overlap[env, row]
     for i in range(rise.shape[2]):
-        clear = under[env, row, i] - rest[row, i]
-        if not wp.isfinite(clear):
+        clear = above[i] - at_rest[i]
+        if not (clear < _INF):
             clear = open_gap
-        u = wp.float64(rise[env, row, i]) - clear
-        overlap[env, row, i] = wp.float32(u)
+        u = wp.float64(risen[i]) - clear
+        overlapped[i] = wp.float32(u)
         if u > -clear_gap:
             from_, to = wp.min(from_, i), wp.max(to, i + 1)
     near[env, row] = wp.vec2i(from_, to)
@@ -206,13 +208,17 @@ def begin(
     env, row = wp.tid()
     columns, rows = s.columns[env], s.rows[env]
     is_in = row >= rows[0] and row < rows[1]
+    pressure, kept, direction, overlapped = p[env, row], best[env, row], t[env, row], overlap[env, row]
     for i in range(p.shape[2]):
-        value = wp.float32(0.0)
-        if is_in and i >= columns[0] and i < columns[1] and overlap[env, row, i] > _ZERO:
-            value = wp.max(start[env, row, i], greatest[env] * wp.float32(1e-3))
-        p[env, row, i] = value
-        best[env, row, i] = value
-        t[env, row, i] = _ZERO
+        pressure[i] = _ZERO
+        kept[i] = _ZERO
+        direction[i] = _ZERO
+    if is_in:
+        for i in range(columns[0], columns[1]):
+            if overlapped[i] > _ZERO:
+                value = wp.max(start[env, row, i], greatest[env] * wp.float32(1e-3))
+                pressure[i] = value
+                kept[i] = value
     overlapping[env, row] = 1
 
 
@@ -411,20 +417,6 @@ def fold(values: wp.array2d(dtype=wp.float32), out: wp.array3d(dtype=wp.float32)
 
 
 @wp.kernel
-def scale(
-    active: wp.array(dtype=wp.int32), factor: wp.array3d(dtype=wp.float32), field: wp.array3d(dtype=wp.float32),
-    # outputs
-    out: wp.array3d(dtype=wp.float32),
-):  # fmt: skip
-    """Field times a factor for all environments, by (environment, row)."""
-    env, row = wp.tid()
-    if active[env] == 0:
-        return
-    for i in range(field.shape[2]):
-        out[env, row, i] = field[env, row, i] * factor[0, row, i]
-
-
-@wp.kernel
 def convolve(
     active: wp.array(dtype=wp.int32), columns: wp.array(dtype=wp.vec2i), table: wp.array2d(dtype=Any),
     half: wp.array3d(dtype=Any), nodes: wp.int32, threads: wp.int32,
@@ -484,14 +476,16 @@ def lay(
     """
     env, row = wp.tid()
     touched = wp.isfinite(clearance[env])
+    at_rest, shown, marks, flat = rest[row], height[env, row], contact[env, row], plain[env, row]
+    pressure, risen, dented, above = p[env, near_y[row]], rise[env, row], dent[env, row], under[env, row]
     for i in range(height.shape[2]):
-        z, mark = rest[row, i] + wp.float64(plain[env, row, i]), wp.uint8(0)
+        z, mark = at_rest[i] + wp.float64(flat[i]), wp.uint8(0)
         if touched:
-            pressed = p[env, near_y[row], near_x[i]] > _ZERO
+            pressed = pressure[near_x[i]] > _ZERO
             if is_laid != 0:
-                z = rest[row, i] + wp.float64(rise[env, row, i]) - wp.float64(dent[env, row, i])
-                gap = under[env, row, i] - z
-                if wp.isfinite(gap):
+                z = at_rest[i] + wp.float64(risen[i]) - wp.float64(dented[i])
+                gap = above[i] - z
+                if gap < _INF:
                     if pressed:
                         mark = wp.uint8(1)
                     if gap < _0:
@@ -501,5 +495,5 @@ def lay(
                         z += closed_gap * g / (wp.float64(1.0) + g * g)
             elif pressed:
                 mark = wp.uint8(1)
-        height[env, row, i] = wp.float32(z)
-        contact[env, row, i] = mark
+        shown[i] = wp.float32(z)
+        marks[i] = mark

@@ -96,3 +96,54 @@ def sampled(field: wp.array3d(dtype=wp.float32), env: wp.int32, lines: Lines, pl
     near = (_1 - a) * wp.float64(field[env, j, i]) + a * wp.float64(field[env, j, i + 1])
     far = (_1 - a) * wp.float64(field[env, j + 1, i]) + a * wp.float64(field[env, j + 1, i + 1])
     return (_1 - b) * near + b * far
+
+
+@wp.kernel
+def sort_waves(
+    active: wp.array(dtype=wp.int32), factor: wp.array3d(dtype=wp.float32), waves: wp.array3d(dtype=wp.float32),
+    # outputs
+    out: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
+    """Amplitudes times a factor, even waves before odd ones along both axes.
+
+    By (environment, row).
+    """
+    env, row = wp.tid()
+    if active[env] == 0:
+        return
+    rows, count = (waves.shape[1] + 1) / 2, (waves.shape[2] + 1) / 2
+    k = 2 * row
+    if row >= rows:
+        k = 2 * (row - rows) + 1
+    into, source, share = out[env, row], waves[env, k], factor[0, k]
+    for i in range(count):
+        into[i] = source[2 * i] * share[2 * i]
+    for i in range(waves.shape[2] - count):
+        into[count + i] = source[2 * i + 1] * share[2 * i + 1]
+
+
+@wp.kernel
+def unfold(
+    active: wp.array(dtype=wp.int32), even: wp.array3d(dtype=wp.float32), odd_x: wp.array3d(dtype=wp.float32),
+    odd_y: wp.array3d(dtype=wp.float32), odd: wp.array3d(dtype=wp.float32),
+    # outputs
+    out: wp.array3d(dtype=wp.float32),
+):  # fmt: skip
+    """Field at all nodes, from the sums of even and odd waves at those of a quarter.
+
+    By (environment, row of the quarter).
+    """
+    env, j = wp.tid()
+    if active[env] == 0:
+        return
+    count, last = even.shape[2], out.shape[2] - 1
+    upper, lower = out[env, j], out[env, out.shape[1] - 1 - j]
+    a, b, c, d = even[env, j], odd_x[env, j], odd_y[env, j], odd[env, j]
+    for i in range(count):
+        near, far = a[i] + b[i], c[i] + d[i]
+        upper[i] = near + far
+        lower[i] = near - far
+    for i in range(count):
+        near, far = a[i] - b[i], c[i] - d[i]
+        upper[last - i] = near + far
+        lower[last - i] = near - far

@@ -1,4 +1,4 @@
-"""Displacements in the plane as sums of plane waves, and evenly spaced nodes, on a device."""
+"""Sums of waves over the nodes of a grid, and evenly spaced nodes, on a device."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import warp as wp
 
 from raytac.gel.products import Matrices, Products
 from raytac.physics.soft.correction.cosine_series import CosineSeries
-from raytac.physics.soft.correction.plane_kernels import Lines
+from raytac.physics.soft.correction.plane_kernels import Lines, sort_waves, unfold
 
 
 def node_lines(x: np.ndarray, y: np.ndarray) -> Any:
@@ -63,3 +63,37 @@ class PlaneWaves:
         ):
             multiply(along_y, wave, self._spare, rows=rows, active=active)
             multiply(self._spare, along_x, field, rows=rows, columns=columns, active=active)
+
+
+class CosineSum:
+    """Synthesis of a field from the amplitudes of all cosines of a grid, at its nodes.
+
+    A cosine at the mirror image of a node in the grid's middle is the same, or of odd waves the opposite. So even and odd waves are summed
+    apart at the nodes of one quarter, in half of the operations.
+    """
+
+    def __init__(self, along: tuple[CosineSeries, CosineSeries], x: np.ndarray, y: np.ndarray, products: Products) -> None:
+        """Prepare the nodes ``x``, ``y`` [m] of the series ``along`` x and y."""
+        self._products, (ny, nx) = products, (len(y), len(x))
+        order_y, order_x = (np.r_[0:n:2, 1:n:2] for n in (ny, nx))
+        half_y, half_x = ((n + 1) // 2 for n in (ny, nx))
+        self._cos_y = products.constant(along[1].synthesis(y[:half_y])[:, order_y])
+        self._cos_x = products.constant(along[0].synthesis(x[:half_x])[:, order_x].T)
+        self._parts_y, self._parts_x = (
+            [products.part(0, half), products.part(half, n)] for half, n in ((half_y, ny), (half_x, nx))
+        )
+        self._sorted = products.zeros(ny, nx)
+        self._rows = [products.zeros(half_y, nx) for _ in range(2)]
+        self._quarters = [[products.zeros(half_y, half_x) for _ in range(2)] for _ in range(2)]
+
+    def find(self, factor: Matrices, amplitudes: Matrices, active: wp.array, out: Matrices) -> None:
+        """Launch the field of ``amplitudes`` times a ``factor`` that all environments share."""
+        products, device, lines = self._products, self._products.device, len(active)
+        inputs = [active, factor.numbers, amplitudes.numbers, self._sorted.numbers]
+        wp.launch(sort_waves, (lines, out.shape[0]), inputs=inputs, device=device)
+        for part, rows, quarters in zip(self._parts_y, self._rows, self._quarters, strict=True):
+            products.multiply(self._cos_y, self._sorted, rows, inner=part, active=active)
+            for across, quarter in zip(self._parts_x, quarters, strict=True):
+                products.multiply(rows, self._cos_x, quarter, inner=across, active=active)
+        fields = [quarter.numbers for quarters in self._quarters for quarter in quarters]
+        wp.launch(unfold, (lines, self._cos_y.shape[0]), inputs=[active, *fields, out.numbers], device=device)

@@ -8,13 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 
 from raytac.gel.interpolate import sampled
+from raytac.gel.products import Products
 from raytac.gel.surface import make_grid
 from raytac.physics.bonded_layer import layer_compliance, layer_spread
 from raytac.physics.soft.correction import mesh_compliance
 from raytac.physics.soft.correction.cosine_series import CosineSeries
 from raytac.physics.soft.correction.mesh_compliance import coat_compliance, correction_compliances, rest_stiffness
+from raytac.physics.soft.correction.plane_waves import CosineSum
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
 from raytac.physics.soft.settings import Correction
 from raytac.specs import load_sensor
@@ -257,6 +260,22 @@ def test_waves_of_two_cells_are_taken_out_and_straight_lines_stay():
     even = _smoothing(lines)
     assert np.allclose(even @ (3.0 - 2.0 * lines), 3.0 - 2.0 * lines)
     assert np.abs((even @ (-1.0) ** np.arange(7))[1:-1]).max() < 1e-12
+
+
+@pytest.mark.parametrize(("ny", "nx"), [(12, 17), (9, 10)])
+def test_a_sum_of_cosines_by_quarters_is_that_of_all_nodes(ny: int, nx: int) -> None:
+    """Of even and odd numbers of nodes, in two environments of three."""
+    rng, products = np.random.default_rng(3), Products(3, "cpu")
+    x, y = np.linspace(-3e-3, 5e-3, nx), np.linspace(-2e-3, 2e-3, ny)
+    along = CosineSeries(x), CosineSeries(y)
+    amplitudes, out = products.zeros(ny, nx), products.zeros(ny, nx)
+    factor, values = rng.random((ny, nx)), rng.normal(size=(3, ny, nx))
+    amplitudes.numbers.assign(values.astype(np.float32))
+    active = wp.array([1, 0, 1], dtype=wp.int32, device="cpu")
+    CosineSum(along, x, y, products).find(products.constant(factor), amplitudes, active, out)
+    expected = along[1].synthesis(y) @ (values * factor) @ along[0].synthesis(x).T
+    expected[1] = 0.0
+    np.testing.assert_allclose(out.numbers.numpy(), expected, rtol=0, atol=2e-5)
 
 
 def test_pads_of_one_mesh_share_their_compliances_and_others_do_not(monkeypatch: pytest.MonkeyPatch) -> None:

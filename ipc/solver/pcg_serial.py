@@ -1,0 +1,112 @@
+"""Conjugate gradients of an environment by one thread (:mod:`ipc.solver.halves`)."""
+
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportOperatorIssue=false
+
+from __future__ import annotations
+
+import warp as wp
+
+from ipc.arrays import IntArray, MatArray2d, Vec4Array2d, VecArray2d
+from ipc.contact.contacts import Contacts
+from ipc.solver.affine_elimination import Elimination, finish_elimination
+from ipc.solver.halves import filled_up, head, multiply_half
+from ipc.solver.linear import SystemView
+from ipc.solver.lines import Lines, apply_lines
+from ipc.solver.pcg_block import Scalars
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Vectors:
+    """Work space (B, N): r, p, H p or z; and of the elimination of affine bodies, r and z."""
+
+    r: Vec4Array2d
+    p: Vec4Array2d
+    Ap: Vec4Array2d
+    source: VecArray2d
+    result: VecArray2d
+
+
+def make_vectors(batch: int, nodes: int, device: wp.Device) -> Vectors:
+    """Work space of zeros: bonded nodes stay 0."""
+    vectors = Vectors()
+    for name in ("r", "p", "Ap"):
+        setattr(vectors, name, wp.zeros((batch, nodes), dtype=wp.vec4d, device=device))
+    vectors.source, vectors.result = (wp.zeros((batch, nodes), dtype=wp.vec3d, device=device) for _ in range(2))
+    return vectors
+
+
+@wp.func
+def precondition(lines: Lines, inverse: MatArray2d, affine: Elimination, env: wp.int32, w: Vectors, z: Vec4Array2d) -> wp.float64:
+    """z = M⁻¹ r; returns r·z."""
+    rz = apply_lines(lines, env, w.r, z)
+    if affine.node.shape[0] > 0:
+        for k in range(lines.node.shape[0]):
+            i = lines.node[k]
+            w.source[env, i] = head(w.r[env, i])
+            w.result[env, i] = head(z[env, i])
+        finish_elimination(affine, inverse, env, 0, 1, w.source, w.result)
+        rz = wp.float64(0.0)
+        for k in range(lines.node.shape[0]):
+            i = lines.node[k]
+            z[env, i] = filled_up(w.result[env, i])
+            rz += wp.dot(w.source[env, i], w.result[env, i])
+    return rz
+
+
+@wp.kernel
+def solve_serially(
+    system: SystemView,
+    contacts: Contacts,
+    inverse: MatArray2d,
+    lines: Lines,
+    affine: Elimination,
+    tolerance: wp.float64,
+    max_iterations: wp.int32,
+    active: IntArray,
+    w: Vectors,
+    # outputs
+    r: VecArray2d,
+    x: VecArray2d,
+    s: Scalars,
+):
+    """Add the solution of H δ = r to x; r becomes the residual."""
+    env = wp.tid()
+    if active[env] == 0:
+        return
+    s.iterations[env] = 0
+    s.negative[env] = 0
+    n, rr0 = lines.node.shape[0], wp.float64(0.0)
+    for k in range(n):
+        v = r[env, lines.node[k]]
+        w.r[env, lines.node[k]] = filled_up(v)
+        rr0 += wp.length_sq(v)
+    if rr0 == wp.float64(0.0):
+        return
+    residual, direction, product, solution = w.r[env], w.p[env], w.Ap[env], x[env]
+    rz = precondition(lines, inverse, affine, env, w, w.p)
+    for it in range(max_iterations):
+        curvature = multiply_half(system, contacts, env, w.p, w.Ap)
+        if not (curvature > wp.float64(0.0)):
+            s.negative[env] = 1
+            break
+        s.iterations[env] = it + 1
+        alpha, squares = rz / curvature, wp.vec4d()
+        for k in range(n):
+            i = lines.node[k]
+            solution[i] = solution[i] + alpha * head(direction[i])
+            rest = residual[i] - alpha * product[i]
+            residual[i] = rest
+            squares += wp.cw_mul(rest, rest)
+        if not (squares[0] + squares[1] + squares[2] > tolerance * tolerance * rr0):
+            break
+        new = precondition(lines, inverse, affine, env, w, w.Ap)
+        beta = new / rz
+        rz = new
+        for k in range(n):
+            i = lines.node[k]
+            direction[i] = product[i] + beta * direction[i]
+    for k in range(n):
+        r[env, lines.node[k]] = head(residual[lines.node[k]])
