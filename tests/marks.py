@@ -13,6 +13,7 @@ import importlib.machinery
 import sys
 from collections import defaultdict
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -134,6 +135,7 @@ PLACES: dict[str, tuple[str, ...]] = {
 PACKAGES = {"renderer": ("mitsuba", "drjit"), "solver": ("warp",)}
 
 
+@cache
 def marks_of(path: Path) -> list[str]:
     """Marks of all tests of a file."""
     try:

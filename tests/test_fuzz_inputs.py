@@ -121,7 +121,7 @@ def mutated_toml(data: st.DataObject, text: str) -> bytes:
     return content
 
 
-@pytest.mark.parametrize("count", [300, pytest.param(2000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [150, pytest.param(2000, marks=pytest.mark.slow)])
 def test_mutated_toml(count: int, tmp_path: Path) -> None:
     accepted = 0
     texts = {name: (asset_root("scenes").parent / name).read_text("utf-8") for name in READERS}

@@ -10,7 +10,8 @@ from typing import Annotated, Literal
 import tyro
 
 from raytac.checks import check_number
-from raytac.cli.shared import FitOptions, SolverOptions, kept_if_interrupted, named, print_paths
+from raytac.cli.fit_options import FitOptions
+from raytac.cli.shared import SolverOptions, kept_if_interrupted, named, print_paths
 from raytac.errors import InputError
 from raytac.io.metrics import read_metrics
 from raytac.io.options import parse_names

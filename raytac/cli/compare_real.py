@@ -9,7 +9,8 @@ from typing import Annotated
 
 import tyro
 
-from raytac.cli.shared import FitOptions, named, print_paths
+from raytac.cli.fit_options import FitOptions
+from raytac.cli.shared import named, print_paths
 from raytac.io.options import parse_names
 from raytac.specs.press import PADS
 from raytac.warp_messages import quiet_warp

@@ -39,7 +39,12 @@ def test_a_run_reports_every_check_and_goes_on_where_it_stopped(tmp_path: Path, 
 
 
 def test_processes_and_parts_measure_what_one_process_does(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    options: dict[str, Any] = {"device": "cpu", "grasps": 8, "cases": "grasps_sphere_0,grasps_cylinder_0,grasps_edge_0"}
+    options: dict[str, Any] = {
+        "device": "cpu",
+        "grasps": 8,
+        "seconds": 0.25,
+        "cases": "grasps_sphere_0,grasps_cylinder_0,grasps_edge_0",
+    }
     folders = [tmp_path / name for name in ("one", "two", "both", "alone")]
     first = hard.main(hard.Args(**options, out=folders[0], part="1/2", processes=2, minutes=5.0))
     assert first["rigid_hard.total"] == 2 and first["rigid_hard.grasps"] == 2 and first["rigid_hard.missing"] == 0

@@ -67,9 +67,9 @@ def test_shipped_policies_fit_their_environments() -> None:
 
 @pytest.mark.renderer
 def test_a_shipped_policy_is_filmed_by_name(tmp_path: Path) -> None:
-    """In a process of its own: the GL backend is chosen when MuJoCo is imported. An episode is cut to 0.5 s, since frames take long."""
+    """In a process of its own: the GL backend is chosen when MuJoCo is imported. An episode is cut to 0.25 s, since frames take long."""
     code = (
-        "import sys; from raytac.envs.push_cube import PushCube; PushCube.max_episode_steps = 24; from raytac.cli import main; "
+        "import sys; from raytac.envs.push_cube import PushCube; PushCube.max_episode_steps = 12; from raytac.cli import main; "
     )
     options = ["play", "push_cube_ppo", "--episodes", "1", "--optics", "phong", "--out", str(tmp_path)]
     command = [sys.executable, "-c", code + "sys.exit(main(sys.argv[1:]))", *options]
@@ -82,7 +82,7 @@ def test_a_shipped_policy_is_filmed_by_name(tmp_path: Path) -> None:
     from PIL import Image
 
     with Image.open(tmp_path / "film.gif") as film:
-        assert film.n_frames == 8 and film.size[0] > film.size[1]  # type: ignore[attr-defined]
+        assert film.n_frames == 4 and film.size[0] > film.size[1]  # type: ignore[attr-defined]
         first = np.asarray(film.convert("RGB"), float)
         film.seek(film.n_frames - 1)  # type: ignore[attr-defined]
         assert np.abs(np.asarray(film.convert("RGB"), float) - first).mean() > 1.0

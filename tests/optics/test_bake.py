@@ -160,7 +160,7 @@ def test_shadows_lengthen_with_depth(shadows: tuple[SensorSpec, ShadowTable]) ->
 
 
 def test_another_sensor() -> None:
-    result = bake(load_sensor("gelsight_dome"), device="cpu", resolution=SIZE, settings=replace(QUICK, pins=2))
+    result = bake(load_sensor("gelsight_dome"), device="cpu", resolution=SIZE, settings=replace(QUICK, images=16, pins=2))
     at = result.calibration
     error = errors(result, {"ball": ball(at, 3e-3, 0.8e-3), "rest": at_rest(at.grid)})
     assert error["taxim"]["ball"].box_psnr > 28

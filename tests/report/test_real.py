@@ -20,7 +20,7 @@ from raytac.calibrate.presses import RealPresses, by_press
 from raytac.cli import main
 from raytac.cli.calibrate import CalibrateArgs
 from raytac.cli.compare_real import CompareRealArgs
-from raytac.cli.shared import FROM_SCRATCH, OWN_LEDS, FitOptions, read_data
+from raytac.cli.fit_options import FROM_SCRATCH, OWN_LEDS, FitOptions, read_data
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, make_grid
 from raytac.io.images import read_png, write_png

@@ -16,7 +16,7 @@ from raytac.errors import SpecError
 from raytac.specs import available, load_lights, load_press, load_sensor, validate_press
 
 MINI = load_sensor("gelsight_mini")
-SETTINGS = settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+SETTINGS = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)
 SCALAR = st.one_of(

@@ -12,6 +12,7 @@ from raytac.errors import InputError, SpecError
 from raytac.specs import BodySpec, MountSpec, RobotSpec, TaskScene
 from raytac.world.world import TactileWorld
 
+pytestmark = pytest.mark.usefixtures("few_cells")
 G = 9.81
 BALL = BodySpec("ball", "sphere", {"radius": 0.005}, position=(0.0, 0.0, 0.0051), mass=0.05)
 UP = TaskScene("upward", RobotSpec("fixed_sensor"), (BALL,), physics="ipc", coupling="one_way")
@@ -19,7 +20,7 @@ UP = TaskScene("upward", RobotSpec("fixed_sensor"), (BALL,), physics="ipc", coup
 
 
 @pytest.fixture(scope="module")
-def resting() -> TactileWorld:
+def resting(few_cells: None) -> TactileWorld:
     """The ball after 0.3 s."""
     world = TactileWorld(UP, outputs=("wrench", "traction"))
     for _ in range(30):
