@@ -72,7 +72,7 @@ class Settled:
     """Photographs of one reference session, and what was taken from them."""
 
     shots: Photographs
-    """Presses without drift; ``background`` is the image at rest, a mean in levels of the camera's range."""
+    """Presses without drift; ``background`` is the image at rest, a mean not rounded."""
     drift: Drift
     """Drift of every press, (N, 3): over all presses its mean gain is 1, its mean offset 0."""
     background: Drift

@@ -45,10 +45,8 @@ ROUNDED = 1e-3
 """Most that a matrix may begin beyond these bounds: that of a file is rounded."""
 MOST_BENT = np.array([0.4, 0.1, 0.4])
 """Most of the size of a fitted tone curve's coefficients: with them every curve rises."""
-CLOSER = 0.8, 1.7
-"""Range of a fitted distance from pinhole to pad, over that of the start (a guess).
-
-Gel and plate alone make it up to 1.5 times, and a given distance is uncertain by a fifth."""
+CLOSER = 0.6, 2.5
+"""Range of a fitted distance from pinhole to pad, over that of the start (a guess)."""
 MOST_DISTORTED, MOST_K1 = 0.1, 1.9
 """Most of the size of a fitted distortion (a guess), and of its k1."""
 OFF_DIAGONAL = ~np.eye(3, dtype=bool)
