@@ -15,7 +15,7 @@ from ipc.arrays import IntArray, MatArray2d
 
 wp.set_module_options({"enable_backward": False})
 
-DEFORMED = wp.constant(wp.float64(1.0e-2))
+DEFORMED = wp.constant(wp.float64(0.04))
 """Change of F (Frobenius norm) of an element from which the blocks are computed anew [-]."""
 NONE = wp.constant(-1)
 """Value of ``filled`` in an environment without blocks."""

@@ -72,7 +72,7 @@ class Settled:
     """Photographs of one reference session, and what was taken from them."""
 
     shots: Photographs
-    """Presses without drift; ``background`` is the image at rest in whole levels."""
+    """Presses without drift; ``background`` is the image at rest, a mean not rounded."""
     drift: Drift
     """Drift of every press, (N, 3): over all presses its mean gain is 1, its mean offset 0."""
     background: Drift
@@ -98,7 +98,7 @@ def settled(sensor: SensorSpec, shots: Photographs, *, drift: bool = True) -> Se
         of_background = Drift(of_background.gain / mean.gain, of_background.offset - mean.offset * of_background.gain / mean.gain)
         presses, background = own.removed(shots.presses), of_background.removed(shots.background[None])[0]
         rest = _mean(background, presses, far)
-    return Settled(replace(shots, presses=presses, background=np.rint(rest)), own, of_background)
+    return Settled(replace(shots, presses=presses, background=np.clip(rest, 0, 255).astype(np.float32)), own, of_background)
 
 
 def _mean(background: np.ndarray, presses: np.ndarray, far: np.ndarray) -> np.ndarray:

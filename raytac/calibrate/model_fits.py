@@ -102,8 +102,7 @@ def check_fit(
 def raytrace_mode(sensor: SensorSpec, background: np.ndarray, device: str, tracing: RayTraced) -> Tracer:
     """The ray tracer with the real background (H, W, 3) [levels] as flat field."""
     height, width = background.shape[:2]
-    field = background.astype(np.uint8)
-    return dataclasses.replace(tracing, flat_field=field).build(sensor, resolution=(width, height), device=device)
+    return dataclasses.replace(tracing, flat_field=background).build(sensor, resolution=(width, height), device=device)
 
 
 def fit_models(
@@ -166,7 +165,7 @@ def fit_models(
         elif name == "mlp":
             built[name] = Mlp(fit_mlp(sensor, background, samples, seed=seed)).build(sensor, device=device)
         else:
-            built[name] = Phong(background=background.astype(np.uint8)).build(sensor, device=device)
+            built[name] = Phong(background=np.rint(background).astype(np.uint8)).build(sensor, device=device)
     return Models(sensor, fitted, steady, drift, prior, built, device, tracing)
 
 

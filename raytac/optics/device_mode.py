@@ -333,12 +333,19 @@ class DeviceMode(ABC):
         width, height = self.camera.size
         return envs, height, width
 
-    def _check_image(self, name: str, image: object) -> None:
-        """Raise InputError unless ``image`` is an 8-bit image at this resolution."""
+    def _check_image(self, name: str, image: object, *, floats: bool = False) -> None:
+        """Raise InputError unless ``image`` is an 8-bit image at this resolution.
+
+        With ``floats`` it may also have levels from 0 to 255 as floats.
+        """
         kind = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
-        shape = (*self.camera.resolution[::-1], 3)
-        if kind != f"uint8 {shape}":
-            raise InputError(name, value=kind, rule=f"must be a uint8 image of shape {shape}")
+        shape, other = (*self.camera.resolution[::-1], 3), ", or levels in [0, 255] as floats" if floats else ""
+        if floats and isinstance(image, np.ndarray) and image.shape == shape and image.dtype.kind == "f":
+            least, most = float(np.min(image)), float(np.max(image))
+            if not (least >= 0.0 and most <= 255.0):
+                raise InputError(name, value=f"{least:.4g} to {most:.4g}", rule="must have levels in [0, 255]")
+        elif kind != f"uint8 {shape}":
+            raise InputError(name, value=kind, rule=f"must be a uint8 image of shape {shape}{other}")
 
     def _checked(self, surface: GelSurface) -> tuple[np.ndarray, np.ndarray]:
         """Heights (B, Ny, Nx) float32, failed environments at rest, and which those are (B,)."""

@@ -264,6 +264,8 @@ class TactileSensor:
     ) -> Pad:
         """Put the scene's object before this sensor, and return the physics, which a loop can step.
 
+        On the CPU images of a soft pad take at most half of the cores from now on: else their threads wait busily while the solver runs.
+
         Args:
             scene: name of a shipped press scene, path of a scene file, or a scene.
             offsets: added to the object's x, y per environment [m], pad frame, shape (B, 2) with B = ``num_envs``; None is none.

@@ -45,9 +45,9 @@ def test_the_settled_image_at_rest_is_the_mean_of_what_no_press_reaches(sensor: 
     presses[0, 60, 80], presses[1, 180, 240] = 250.0, 250.0
     shots = Photographs(np.full((240, 320, 3), 84.0), presses, circles, np.full(2, RADIUS))
     found = settled(sensor, shots, drift=False).shots
-    np.testing.assert_array_equal(found.background[120, 160], np.rint((84 + presses[:, 120, 160].sum(0)) / 3))
-    np.testing.assert_array_equal(found.background[60, 80], np.rint((84 + presses[1, 60, 80]) / 2))
-    np.testing.assert_array_equal(found.background[180, 240], np.rint((84 + presses[0, 180, 240]) / 2))
+    np.testing.assert_allclose(found.background[120, 160], (84 + presses[:, 120, 160].sum(0)) / 3, rtol=1e-6)
+    np.testing.assert_allclose(found.background[60, 80], (84 + presses[1, 60, 80]) / 2, rtol=1e-6)
+    np.testing.assert_allclose(found.background[180, 240], (84 + presses[0, 180, 240]) / 2, rtol=1e-6)
     np.testing.assert_array_equal(found.presses, presses)
 
 

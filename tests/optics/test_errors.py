@@ -39,7 +39,12 @@ from tests.optics.scenes import RESOLUTION, at_rest, ball, built, grid_of, led, 
             {"flat_field": np.zeros((61, 80, 3), np.uint8)},
             r"flat_field = 'uint8 \(61, 80, 3\)'.*uint8 image of shape \(60, 80, 3\)",
         ),
-        ({"flat_field": np.zeros((60, 80, 3))}, r"flat_field = 'float64 \(60, 80, 3\)'.*uint8"),
+        (
+            {"flat_field": np.zeros((60, 80, 4))},
+            r"flat_field = 'float64 \(60, 80, 4\)'.*uint8.*or levels in \[0, 255\] as floats",
+        ),
+        ({"flat_field": np.full((60, 80, 3), 255.5)}, r"flat_field = '255\.5 to 255\.5'.*levels in \[0, 255\]"),
+        ({"flat_field": np.full((60, 80, 3), np.nan)}, r"flat_field = 'nan to nan'.*levels in \[0, 255\]"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )

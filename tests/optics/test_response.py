@@ -123,6 +123,16 @@ def test_flat_field_gives_the_background_at_rest(options: dict) -> None:
     assert np.abs(pressed.rgb[0].astype(int) - real).max() > 10
 
 
+def test_a_flat_field_may_have_parts_of_levels() -> None:
+    """A mean of photographs: the image at rest is it, rounded."""
+    spec, real = like_a_mini(), background()
+    for part in (0.25, 0.75):
+        mode = built(RayTraced, spec, resolution=RESOLUTION, device="cpu", flat_field=np.minimum(real + part, 255.0))
+        rgb = mode.render(at_rest(grid_of(spec))).rgb
+        assert rgb is not None
+        assert (rgb[0] == np.minimum(real.astype(int) + round(part), 255)).mean() > 0.99
+
+
 def test_flat_field_scales_in_linear_light(tracer: Build) -> None:
     """image = background × rendered / rendered at rest, before the gamma."""
 

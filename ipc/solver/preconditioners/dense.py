@@ -1,4 +1,4 @@
-"""Dense positive definite matrices, factored, solved and inverted by a block of threads each.
+"""Dense positive definite matrices, factored and solved by a block of threads each.
 
 A = Uᵀ U is computed by panels of ``PANEL`` rows (a left-looking Cholesky factorisation), of which two share their sums over the rows above.
 A thread works on columns, two at a time, and keeps these sums in registers while it runs down the rows, ``TOGETHER`` at a time: memory is

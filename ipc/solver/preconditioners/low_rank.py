@@ -102,7 +102,8 @@ def add_rows(contacts: Contacts, rest: Rest, active: IntArray, lanes: wp.int32, 
 def add_bodies(contacts: Contacts, rows_g: FloatArray3d, rest: Rest, active: IntArray, lanes: wp.int32, small: Small):
     """S += the upper half of Σ g gᵀ of each affine body's rows.
 
-    ``rows_g`` (B, rows, 12) has the numbers of their g. Nearly all rows belong to a body: its twelve unknowns are added up by entries of S, and not by rows, which would all meet there.
+    ``rows_g`` (B, rows, 12) has the numbers of their g. Nearly all rows belong to a body: its twelve unknowns are added up by entries of
+    S, and not by rows, which would all meet there.
     """
     env, body, lane = wp.tid()
     if active[env] == 0 or not fits(small, env):

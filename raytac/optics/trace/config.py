@@ -36,7 +36,8 @@ class RayTraced(OpticsConfig[Any]):
     max_depth: int = -1
     """Sampled integrators: number of reflections; 1 is direct light only, −1 has no limit."""
     flat_field: np.ndarray | None = None
-    """Real image at rest, (H, W, 3) uint8; images are it × rendered / rendered at rest, linear."""
+    """Real image at rest, (H, W, 3), uint8 or levels as floats, such as a mean of photographs.
+    Images are it × rendered / rendered at rest, in linear light."""
     denoise: bool = False
     """Filter sampled layers (OptiX on CUDA, Open Image Denoise on the CPU)."""
     progress: bool = False

@@ -43,7 +43,7 @@ class Tracer(DeviceMode):
         spec = unlit if sensor.response.exposure == AUTO else sensor.response
         self.response = Response(spec, self.camera, monochrome=sensor.camera.monochrome)
         if config.flat_field is not None:
-            self._check_image("flat_field", config.flat_field)
+            self._check_image("flat_field", config.flat_field, floats=True)
 
     @property
     @abstractmethod

@@ -288,11 +288,14 @@ class _Batch:
             under = finer.under
         normal.solve(state.forces, clearance, sound, under)
         self._solved = normal.search.best
-        self._products.sandwich(self._rows, normal.rise, self._columns, self._half_product, self._normal_rise)
+        normal_rise = normal.over
+        if fine is not None:
+            normal_rise = self._normal_rise
+            self._products.sandwich(self._rows, normal.rise, self._columns, self._half_product, normal_rise)
         laid = [int(correction.normal), correction.closed_gap, clearance, *sampler.nearest, normal.pressure.numbers, self._rest]
         fields = [
             rise,
-            self._normal_rise.numbers,
+            normal_rise.numbers,
             sampler.dent(normal).numbers,
             self._undersides.under,
             self._height,
@@ -321,7 +324,7 @@ class _Batch:
 
     @cached_property
     def _normal_rise(self) -> Any:
-        """Rise of the corrected contact on the grid [m]; made at the first correction."""
+        """Rise of the corrected contact on the grid [m], if that is not the fine one."""
         return self._products.zeros(*self._reader.grid.shape)
 
     def _on_device(self, values: np.ndarray, dtype: Any) -> wp.array:

@@ -75,7 +75,7 @@ class NormalCorrection:
         load: normal force on the vertices [N], (B, V), float64.
         touching: 1 where a vertex is in contact, (B, V), int32.
         mesh_forces: normal forces on the vertices [N] that hold the linear mesh in contact, (B, V), float64.
-        rise: w − E w on the lattice [m], as of ``CoatSurface.rise``.
+        rise: w − E w on the lattice [m], as of ``CoatSurface.rise``.    over: the same at the nodes of the fine grid [m].
         pressure: p on the fine grid [Pa], >= 0.
         waves: cosine amplitudes of the pressure [Pa].
         dent: A p at the nodes of the fine grid [m], where anything touches.
@@ -119,7 +119,7 @@ class NormalCorrection:
         self._smooth = tuple(wp.array(_smoothing(t), dtype=wp.vec3d, device=device) for t in (mesh.lines_y, mesh.lines_x))
         self.holding = VertexForces(compliance, products)
         self._rows, self._columns = surface.matrices(grid.x, grid.y)
-        self._spare, self._over = products.zeros(shape[0], surface.lattice[1]), products.zeros(*shape)
+        self._spare, self.over = products.zeros(shape[0], surface.lattice[1]), products.zeros(*shape)
         self.rise, self._half, self.waves = products.zeros(*surface.lattice), products.zeros(*shape), products.zeros(*shape)
         self.pressure, self._p, self._t = (products.zeros(*shape) for _ in range(3))
         self._g, self._z, self._overlap, self._start = (products.zeros(*shape) for _ in range(4))
@@ -165,8 +165,8 @@ class NormalCorrection:
         # The third component of the displacement is the height.
         self._launch(kernels.smooth_remainder, each, inputs)
         self.surface.rise_of(self._remainder, self.rise)
-        self.products.sandwich(self._rows, self.rise, self._columns, self._spare, self._over)
-        gaps = [self.settings.open_gap, self.settings.clear_gap, self._rest, self._over.numbers, under]
+        self.products.sandwich(self._rows, self.rise, self._columns, self._spare, self.over)
+        gaps = [self.settings.open_gap, self.settings.clear_gap, self._rest, self.over.numbers, under]
         self._launch(kernels.overlaps, lines, [*gaps, self._overlap.numbers, self._near])
         self._launch(kernels.choose_windows, each[0], [sound, clearance, self._near, s])
         self._launch(kernels.first_pressures, lines, [s, self.hats, self._wide, self.load, self._start.numbers])
