@@ -12,6 +12,7 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
@@ -75,6 +76,7 @@ in_mm = Unit(*_UNITS["mm"]).shown
 """A length or several [m] as a file writes them [mm]."""
 
 
+@lru_cache(maxsize=1024)
 def split_unit(key: str) -> tuple[str, Unit]:
     """``"thickness_mm"`` to ``("thickness", millimetres)``; a key without unit stays as it is."""
     for suffix, parts in _UNITS.items():
@@ -238,6 +240,7 @@ class Flag(_Field):
         return value
 
 
+@lru_cache(maxsize=1024)
 def _in_si(interval: Interval, unit: Unit) -> Interval:
     """The same range in SI. Conversion is monotone: what is in one range is in the other."""
     return Interval(unit.to_si(interval.low), unit.to_si(interval.high), interval.low_open, interval.high_open)
