@@ -16,8 +16,9 @@ BESIDE = $(MAKE) --no-print-directory --jobs 2
 TWO := -n 2 --dist worksteal
 PACKAGES := raytac ipc examples experiments tests
 SOURCES = $(shell find $(PACKAGES) -name '*.py' 2>/dev/null)
-# What types depend on: declarations too, and folders, which change where a file is removed.
-TYPED = $(SOURCES) $(shell find $(PACKAGES) -name '*.pyi' -o -type d ! -name __pycache__ 2>/dev/null)
+TYPED := $(shell find $(PACKAGES) -name '*.py' -o -name '*.pyi' 2>/dev/null | sort)
+# Stamp of all types: named by the list of files, since a file that is removed changes no other.
+ALL_TYPES := $(VENV)/.types-of-$(firstword $(shell echo '$(TYPED)' | cksum))
 
 demo: $(VENV)/.installed
 	$(BIN)/python experiments/press_sheet.py --out $(OUT)
@@ -46,12 +47,13 @@ rules: $(VENV)/.installed-test
 	$(BIN)/ruff check .
 	$(BIN)/lint-imports --no-cache
 
-types: $(VENV)/.types-all
+types: $(ALL_TYPES)
 
-# Types of everything, three minutes of one core, where anything has changed since they were right.
-$(VENV)/.types-all: $(TYPED) pyproject.toml $(VENV)/.installed-test
+# Types of everything, three minutes of one core, where anything has changed since they were right. What changes meanwhile is newer.
+$(ALL_TYPES): $(TYPED) pyproject.toml $(VENV)/.installed-test
+	@touch $(VENV)/.types-begun
 	$(BIN)/pyright
-	@touch $(VENV)/.types $@
+	@rm -f $(VENV)/.types-of-* && cp -p $(VENV)/.types-begun $(VENV)/.types && mv $(VENV)/.types-begun $@
 
 # Types of the files that changed since all of them were right; those that import them are seen by `make types`, a part of `make test`.
 $(VENV)/.types: $(SOURCES) pyproject.toml

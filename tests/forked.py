@@ -12,6 +12,7 @@ import importlib
 import json
 import os
 import runpy
+import signal
 import subprocess
 import sys
 import tempfile
@@ -43,6 +44,8 @@ IMPORTED = (
     "raytac.report.preview",
     "raytac.markers.tracker",
     "raytac.world.world",
+    "raytac.world.rigid_pads",
+    "raytac.world.tactile_reader",
     "raytac.observe.observer",
 )
 """Modules that several scripts import; those of absent extras are left out."""
@@ -64,9 +67,15 @@ def run_forked(*command: str, cwd: Path, env: Mapping[str, str] | None = None) -
         }
         server = _server()
         assert server.stdin is not None and server.stdout is not None
-        server.stdin.write(json.dumps(request) + "\n")
-        server.stdin.flush()
-        code = int(server.stdout.readline())
+        try:
+            server.stdin.write(json.dumps(request) + "\n")
+            server.stdin.flush()
+            code = int(server.stdout.readline())
+        except BaseException:  # a timeout or Ctrl-C: the script may still run, and its answer would be taken for the next one's
+            os.killpg(server.pid, signal.SIGKILL)
+            server.wait()
+            _server.cache_clear()
+            raise
         said, errors = (Path(file).read_text(encoding="utf-8") for file in files)
     return subprocess.CompletedProcess(command, code, said, errors)
 
@@ -75,12 +84,14 @@ def run_forked(*command: str, cwd: Path, env: Mapping[str, str] | None = None) -
 def _server() -> subprocess.Popen[str]:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path]), "MPLBACKEND": "Agg"}
     command = [sys.executable, "-m", "tests.forked"]
-    server = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=environment)
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    server = subprocess.Popen(command, cwd=ROOT, env=environment, start_new_session=True, **pipes)
 
     def end() -> None:
         assert server.stdin is not None
-        server.stdin.close()  # what it reads no more ends it
-        server.wait()
+        if server.poll() is None:
+            server.stdin.close()  # it ends when it reads no more
+            server.wait()
 
     atexit.register(end)
     return server

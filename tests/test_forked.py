@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -44,3 +45,22 @@ def test_an_error_is_told_and_nothing_of_a_script_stays(tmp_path: Path) -> None:
 def test_a_module_runs_as_a_program(tmp_path: Path) -> None:
     done = run_forked("-m", "raytac", "press", "coin", "--optics", "phng", cwd=tmp_path)
     assert done.returncode == 2 and "did you mean 'phong'" in done.stderr and not done.stdout
+
+
+def test_after_a_script_that_does_not_end_the_next_one_has_its_own_answer(tmp_path: Path) -> None:
+    (tmp_path / "waits.py").write_text("import time; time.sleep(600)")
+    (tmp_path / "tells.py").write_text("print('told'); raise SystemExit(5)")
+    run_forked("tells.py", cwd=tmp_path)  # the imports
+
+    def late(*_: object) -> None:
+        raise TimeoutError
+
+    before = signal.signal(signal.SIGALRM, late), signal.setitimer(signal.ITIMER_REAL, 1.0)
+    try:
+        with pytest.raises(TimeoutError):
+            run_forked("waits.py", cwd=tmp_path)
+    finally:
+        signal.signal(signal.SIGALRM, before[0])
+        signal.setitimer(signal.ITIMER_REAL, *before[1])
+    done = run_forked("tells.py", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (5, "told\n")

@@ -78,24 +78,35 @@ def test_a_check_asks_for_the_types_of_what_changed_only(checkout: Path) -> None
 
 
 @needs_make
-@pytest.mark.parametrize("change", ["raytac/kept.py", "raytac/kept.pyi", "pyproject.toml", ".venv/.installed-test", None])
+@pytest.mark.parametrize(
+    "change", ["raytac/kept.py", "raytac/kept.pyi", "pyproject.toml", ".venv/.installed-test", "new.py", None]
+)
 def test_the_whole_suite_asks_for_all_types_unless_nothing_has_changed(checkout: Path, change: str | None) -> None:
+    """A file that is removed, and one that changes while pyright runs, count too."""
     (checkout / "raytac" / "__pycache__").mkdir(parents=True)
     for name in ("kept.py", "kept.pyi", "removed.py"):
         (checkout / "raytac" / name).touch()
     past = time.time() - 10
-    for path in (*checkout.rglob("*"), checkout / "raytac"):
+    for path in checkout.rglob("*"):
         os.utime(path, (past, past))
-    (checkout / ".venv" / ".types-all").touch()
+    (checkout / ".venv" / "bin").mkdir()
+    checker = checkout / ".venv" / "bin" / "pyright"
+    checker.write_text("#!/bin/sh\necho checked\n" + ("sleep 0.05; touch raytac/new.py\n" if change == "new.py" else ""))
+    checker.chmod(0o755)
+    if change == "new.py":
+        (checkout / "raytac" / "new.py").touch()
+    made = [subprocess.run(["make", "types"], cwd=checkout, capture_output=True, text=True, check=True).stdout for _ in range(2)]
+    assert "checked" in made[0] and ("checked" in made[1]) == (change == "new.py")
     (checkout / "raytac" / "__pycache__" / "kept.pyc").touch()
+    if change == "new.py":
+        return
     assert "pyright" not in planned(checkout, "test")
     later = time.time() + 10
     if change is None:
         (checkout / "raytac" / "removed.py").unlink()
-        os.utime(checkout / "raytac", (later, later))
     else:
         os.utime(checkout / change, (later, later))
-    (line,) = [line for line in planned(checkout, "test").splitlines() if "pyright" in line]
+    (line,) = [line for line in planned(checkout, "test").splitlines() if line.endswith("pyright")]
     assert line.split()[1:] == []
 
 

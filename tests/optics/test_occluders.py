@@ -79,7 +79,7 @@ def test_what_is_left_out_sees_all_of_its_led(
     tracer: Build, monkeypatch: pytest.MonkeyPatch, spans: list[list[np.ndarray]], name: str, shape: str
 ) -> None:
     mode, height = prepared(tracer, name), pressed(SPECS[name], shape)
-    found = shares(mode, height)
+    found, spans = shares(mode, height), spans[-1:]  # not those of the image at rest, if the tracer rendered one for its warning
 
     def all_of_them(self: Occluders, mi: Any, depths: Any, lamps: Any) -> list[Any]:
         blocks = dr.zeros(mi.Float, dr.width(depths.blocks) // 2)
@@ -92,8 +92,8 @@ def test_what_is_left_out_sees_all_of_its_led(
     assert expected.min() < 0.5, "no shadow"
     np.testing.assert_allclose(found, expected, atol=1e-6)
     skipped = np.mean([span[:, 0] > span[:, 1] for span in spans[0]])
-    # Behind a dome that falls off as steeply as light arrives, gel that bulges may shade anything.
-    assert skipped > (0.05 if shape == "pillars" else -1), f"only {skipped:.1%} of the blocks are left out"
+    # Behind a dome that falls off as steeply as light arrives, gel that is touched may shade anything, and so does what bulges.
+    assert skipped > (0.05 if shape == "pillars" and name != "domed" else -1), f"only {skipped:.1%} of the blocks are left out"
 
 
 @pytest.mark.parametrize("name", SPECS)
