@@ -10,7 +10,6 @@ import warp as wp
 
 from raytac.robots.states import NumberWriter, StateReader
 from raytac.world.coupling import Coupling, coupling_numbers
-from raytac.world.engine.env_threads import EnvThreads
 from raytac.world.environment_models import EnvironmentModels
 
 
@@ -38,11 +37,9 @@ class CCoupling:
         *,
         contacts: int,
         solver_bodies: int = 0,
-        threads: EnvThreads | None = None,
     ) -> None:
         """``models``, ``datas``: of every environment; the others are as of ``Coupling``."""
         self._models, self._datas, model = models, tuple(datas), models[0]
-        self._threads = threads or EnvThreads()
         # Before the readers look for the bodies' numbers, the law checks that they are there.
         known = [body for body in bodies if 0 <= body < model.nbody]
         self._reader = StateReader(self._datas, coupling_numbers(model, known))
@@ -73,15 +70,13 @@ class CCoupling:
         touched = [b for b in envs if self._count[b]]
         if not touched:
             return
-        self._threads.run(self._accelerate, touched)
+        for b in touched:
+            mujoco.mj_fwdActuation(self._models[b], self._datas[b])
+            mujoco.mj_fwdAcceleration(self._models[b], self._datas[b])
         self._choose(touched)
         self._reader.read()
         self.law.apply(self._chosen)
         self._write(touched)
-
-    def _accelerate(self, env: int) -> None:
-        mujoco.mj_fwdActuation(self._models[env], self._datas[env])
-        mujoco.mj_fwdAcceleration(self._models[env], self._datas[env])
 
     def _choose(self, envs: Sequence[int]) -> None:
         self._mask[:] = 0

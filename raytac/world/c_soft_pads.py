@@ -15,7 +15,6 @@ from raytac.physics.soft.scene_state import SceneReport
 from raytac.robots.states import NumberWriter, StateReader, body_pose, site_pose
 from raytac.se3 import quaternions
 from raytac.world.c_coupling import CCoupling
-from raytac.world.engine.env_threads import EnvThreads
 from raytac.world.environment_models import EnvironmentModels
 from raytac.world.forbidden_overlap import Inside, RobotOverlap
 from raytac.world.soft_pads import SoftPads
@@ -48,7 +47,7 @@ class CSoftPads(SoftPads):
         self._models, self._datas, model = models, tuple(datas), composed.model
         sites = np.array([model.site(m.site).id for m in composed.sensors], int)
         driven = {body.name: body_pose(body.index) for body in composed.touched if body.is_free}
-        self._reader, self._threads = StateReader(self._datas, {"pads": site_pose(sites)} | driven), EnvThreads()
+        self._reader = StateReader(self._datas, {"pads": site_pose(sites)} | driven)
         super().__init__(composed, self._pad_poses(), physics=physics, coupling=coupling, device=device)
         self._mirrors = [
             (body.name, *(NumberWriter(self._datas, member, size * body.mocap + np.arange(size)) for member, size in _MOCAP))
@@ -60,7 +59,7 @@ class CSoftPads(SoftPads):
         self._coupling = None
         if self._inputs is not None:
             room = {"contacts": self._inputs.contacts, "solver_bodies": self._inputs.solver_bodies}
-            self._coupling = CCoupling(models, self._datas, self.coupled_bodies, **room, threads=self._threads)
+            self._coupling = CCoupling(models, self._datas, self.coupled_bodies, **room)
             self._chosen = wp.zeros(len(datas), dtype=wp.int32, device="cpu")
 
     def reset(self, envs: Sequence[int], bodies: Mapping[str, np.ndarray] | None = None) -> None:
@@ -108,13 +107,17 @@ class CSoftPads(SoftPads):
         models, datas, alive = self._models, self._datas, np.flatnonzero(~failed).tolist()
         if not alive:
             return
-        self._threads.run(lambda b: mujoco.mj_step1(models[b], datas[b]), alive)
+        for b in alive:
+            mujoco.mj_step1(models[b], datas[b])
         drive(alive)
         if self._coupling is not None:
             self._coupling.apply(alive)
-        self._threads.run(lambda b: mujoco.mj_step2(models[b], datas[b]), alive)
+        for b in alive:
+            mujoco.mj_step2(models[b], datas[b])
         failed[alive] = lost(*(np.array([getattr(datas[b], name) for b in alive]) for name in ("qvel", "qpos")))
-        self._threads.run(lambda b: _update_poses(models[b], datas[b]), np.flatnonzero(~failed).tolist())
+        for b in np.flatnonzero(~failed).tolist():
+            mujoco.mj_kinematics(models[b], datas[b])
+            mujoco.mj_comPos(models[b], datas[b])
 
     def _now(self, failed: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """MuJoCo's poses of cases and of its bodies; failed environments keep their last ones."""
@@ -149,7 +152,8 @@ class CSoftPads(SoftPads):
             place.write(envs)
             turn.write(envs)
         if self._own:
-            self._threads.run(lambda b: mujoco.mj_kinematics(self._models[b], self._datas[b]), envs)
+            for b in envs:
+                mujoco.mj_kinematics(self._models[b], self._datas[b])
 
     def _inside(self, envs: Sequence[int] | range | np.ndarray, *, only_rigid: bool = False) -> Iterator[tuple[int, Inside]]:
         """Overlaps with cases and links by environment: rigid bodies in MuJoCo, soft by vertices."""
@@ -184,8 +188,3 @@ class CSoftPads(SoftPads):
     def _pad_poses(self) -> np.ndarray:
         """``world_from_pad`` of every environment and pad, (B, S, 4, 4)."""
         return self._reader.values()["pads"]
-
-
-def _update_poses(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)

@@ -56,7 +56,7 @@ def test_the_formula(tracer: Build) -> None:
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
 def test_device_and_host_encode_alike(tracer: Build, device: str) -> None:
     mi, _ = load_mitsuba(device)
-    response = Response(CURVE, tracer(like_a_mini()).camera)
+    response = Response(CURVE, tracer(like_a_mini(), device=device).camera)
     batch = linear_image((2, 60, 80, 3))
     channels = [mi.Float(np.ascontiguousarray(batch[..., c]).ravel()) for c in range(3)]
     u8 = response.encode(mi, channels, response.device_scale(mi))
