@@ -101,7 +101,7 @@ def _require_llvm() -> None:
 
 
 def share_cores() -> None:
-    """Let Dr.Jit use at most half of the cores; a smaller number set before stays.
+    """Let Dr.Jit use at most half of the cores from now on; a smaller number set before stays.
 
     Its threads wait busily for the next image. Where physics and a policy run between two images, those threads take their cores, and
     libraries whose threads wait for each other then wait for threads that do not run.

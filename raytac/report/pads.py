@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from raytac.device import resolve_device
 from raytac.errors import InputError
 from raytac.frame import TactileFrame
 from raytac.gel.surface import GelSurface
@@ -91,6 +92,10 @@ def press_pads(
         raise InputError("scenes", value=names, rule="must have names that differ: keys of metrics begin with them")
     given = {"outputs": ("rgb", "wrench"), "resolution": resolution, "device": device, "seed": seed}
     sensors = {pad: TactileSensor(sensor, physics=physics, **given) for pad, physics in pads.items()}
+    if resolve_device(device) == "cpu":
+        from raytac.optics.runtime import share_cores
+
+        share_cores()  # for all pads alike: a soft one does so from its first press on
     made = []
     for scene in presses:
         for pad, one in sensors.items():

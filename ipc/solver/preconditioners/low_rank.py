@@ -150,6 +150,7 @@ def give_up(small: Small, env: wp.int32, lane: wp.int32, lanes: wp.int32):
     wait_for_block()
     if lane == 0:
         small.count[env] = 0
+        small.pads[env] = 0
         small.known[env] = -1
 
 

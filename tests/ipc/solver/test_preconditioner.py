@@ -256,6 +256,20 @@ def test_no_contacts_is_the_rest_inverse(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(problem.apply(problem.updated(), r), expected, rtol=0, atol=1e-5 * np.abs(expected).max())
 
 
+def test_rows_that_are_not_finite_leave_the_rest_inverse(rng: np.random.Generator) -> None:
+    """Of the contacts that were there before nothing stays: it is as without any."""
+    problem = Problem(two_pads(), 1, 6, rng, "cpu")
+    preconditioner, r = problem.updated(), rng.normal(size=(1, len(problem.H)))
+    problem.apply(preconditioner, r)
+    rows = problem.contacts.node_row.numpy()
+    rows[0, 0] = 1e200
+    problem.contacts.node_row.assign(rows)
+    preconditioner.update(problem.system, problem.contacts, problem.contacts.row.shape[1], problem.mask())
+    z = problem.apply(preconditioner, r)
+    problem.contacts.row_count.fill_(0)
+    np.testing.assert_array_equal(z, problem.apply(problem.updated(), r))
+
+
 def press(preconditioner: str, steps: int = 4, max_contacts: int | None = None, **changes: object) -> tuple[np.ndarray, int, int]:
     """Positions after a press with a twist, and the Newton and PCG iterations it took."""
     ball = ipc.KinematicBody("ball", ipc.icosphere(4e-3, 2), ipc.Pose((1e-4, 2e-4, 4.12e-3)))
