@@ -104,7 +104,7 @@ class CalibrateArgs(FitOptions, SolverOptions):
         if self.ball_diameter_mm is None:
             raise InputError("ball_diameter_mm", value=None, rule="must be given: the table of forces does not say it")
         sensor = load_sensor(self.sensor)
-        written = run_calibrate_forces(
+        written, table = run_calibrate_forces(
             sensor,
             Path(self.what),
             self.folder("calibrate", "forces", sensor.name),
@@ -114,6 +114,7 @@ class CalibrateArgs(FitOptions, SolverOptions):
             seed=self.seed,
             start=start,
         )
+        print(table)
         return print_paths(written)
 
     def _optics(self, start: float) -> int:

@@ -35,10 +35,10 @@ FILES = ("sensor.toml", "surface.csv", "metrics.json")
 
 def run_calibrate_forces(
     sensor: SensorSpec, data: Path, out: Path, *, diameter_mm: float, pads: Sequence[str], device: str, seed: int, start: float
-) -> list[Path]:
-    """Fit the gel of ``pads`` to the table ``data``, print errors, write ``FILES`` to ``out``.
+) -> tuple[list[Path], str]:
+    """Fit the gel of ``pads`` to the table ``data`` and write ``FILES`` to ``out``.
 
-    Of the readings that a sensor file can hold, the one with least error at held-out depths is written.
+    Returns these files and a table of errors in Markdown. Of the readings that a sensor file can hold, the one with least error at held-out depths is written.
 
     Raises:
         InputError: a table that says nothing, a sensor without a file, or ``out`` cannot be written.
@@ -72,8 +72,7 @@ def run_calibrate_forces(
         write_metrics(folder / "metrics.json", metrics | {"wall_s": time.perf_counter() - start})
         written = [Path(out) / path.name for path in sorted(folder.iterdir())]
     load_sensor(Path(out) / "sensor.toml")  # the written file can be read where it lies
-    print(force_table(fits, best, pads, names, errors))
-    return written
+    return written, force_table(fits, best, pads, names, errors)
 
 
 def check_apart(source: Path, out: Path) -> None:
