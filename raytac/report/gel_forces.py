@@ -38,7 +38,8 @@ def run_calibrate_forces(
 ) -> tuple[list[Path], str]:
     """Fit the gel of ``pads`` to the table ``data`` and write ``FILES`` to ``out``.
 
-    Returns these files and a table of errors in Markdown. Of the readings that a sensor file can hold, the one with least error at held-out depths is written.
+    Returns these files and a table of errors in Markdown. Of the readings that a sensor file can hold, the one with least error at held-out
+    depths is written.
 
     Raises:
         InputError: a table that says nothing, a sensor without a file, or ``out`` cannot be written.
