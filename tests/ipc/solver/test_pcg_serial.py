@@ -110,6 +110,8 @@ def test_solutions_are_those_of_the_dense_matrix(pressed: Pressed, rng: np.rando
 def test_the_preconditioner_is_that_of_other_solvers_but_for_lines(pressed: Pressed, rng: np.random.Generator) -> None:
     """Symmetric and positive; beside affine bodies, where each node is a line, it is block-Jacobi with these bodies eliminated."""
     a, b = rng.normal(size=(2, len(pressed.H)))
+    with pytest.raises(AssertionError, match="pivots of their factors"):
+        pressed.preconditioner.apply(pressed.on_nodes(a), pressed.pot.everyone, pressed.on_nodes(b))
     (za, total), (zb, _) = pressed.preconditioned(a), pressed.preconditioned(b)
     assert total == pytest.approx(a @ za, rel=1e-12) and total > 0
     assert a @ zb == pytest.approx(b @ za, rel=1e-9)
