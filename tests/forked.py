@@ -7,6 +7,7 @@ needs a new interpreter instead. The renderer is not among what is imported, sin
 from __future__ import annotations
 
 import atexit
+import contextlib
 import gc
 import importlib
 import json
@@ -21,6 +22,8 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
+
+from tests.one_thread import ONE_THREAD
 
 ROOT = Path(__file__).parents[1]
 IMPORTED = (
@@ -55,24 +58,23 @@ _ENVIRONMENT = set(os.environ)
 def run_forked(*command: str, cwd: Path, env: Mapping[str, str] | None = None) -> subprocess.CompletedProcess[str]:
     """Run ``python *command``: a script or ``-m MODULE``, and arguments.
 
-    ``env`` is added to the environment. The case's light is fitted with few paths, as in most tests.
+    ``env`` is added to the environment, in which PYTHONPATH, if the caller has none, is this checkout. The case's light is fitted with few
+    paths, as in most tests. Raises RuntimeError if the process that is forked has ended.
     """
     with tempfile.TemporaryDirectory() as folder:
         files = [os.path.join(folder, name) for name in ("stdout", "stderr")]
         request = {
             "command": command,
             "cwd": str(cwd),
-            "env": {**os.environ, **(env or {})},
+            "env": {"PYTHONPATH": str(ROOT), **os.environ, **(env or {})},
             "files": files,
         }
         server = _server()
-        assert server.stdin is not None and server.stdout is not None
         try:
-            server.stdin.write(json.dumps(request) + "\n")
-            server.stdin.flush()
-            code = int(server.stdout.readline())
+            code = _ask(server, request)
         except BaseException:  # a timeout or Ctrl-C: the script may still run, and its answer would be taken for the next one's
-            os.killpg(server.pid, signal.SIGKILL)
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(server.pid, signal.SIGKILL)
             server.wait()
             _server.cache_clear()
             raise
@@ -80,9 +82,21 @@ def run_forked(*command: str, cwd: Path, env: Mapping[str, str] | None = None) -
     return subprocess.CompletedProcess(command, code, said, errors)
 
 
+def _ask(server: subprocess.Popen[str], request: dict[str, Any]) -> int:
+    assert server.stdin is not None and server.stdout is not None
+    answer = ""
+    with contextlib.suppress(BrokenPipeError):
+        server.stdin.write(json.dumps(request) + "\n")
+        server.stdin.flush()
+        answer = server.stdout.readline()
+    if not answer:
+        raise RuntimeError(f"the process that is forked ended with exit code {server.wait()}; standard error says why")
+    return int(answer)
+
+
 @cache
 def _server() -> subprocess.Popen[str]:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path]), "MPLBACKEND": "Agg"}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path]), "MPLBACKEND": "Agg", **ONE_THREAD}
     command = [sys.executable, "-m", "tests.forked"]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     server = subprocess.Popen(command, cwd=ROOT, env=environment, start_new_session=True, **pipes)

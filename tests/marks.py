@@ -121,6 +121,7 @@ PLACES: dict[str, tuple[str, ...]] = {
         "dataset/test_ray_cluster.py",
         "envs/test_rsl.py",
         "envs/test_sb3.py",
+        "documents/test_imports.py",
         "documents/test_python_blocks.py",
         "examples",
         "experiments",

@@ -7,7 +7,8 @@ import sys
 
 NUMPY_WAS_FIRST = "numpy" in sys.modules and os.environ.get("OPENBLAS_NUM_THREADS") != "1"
 """True if NumPy was imported before, and so has as many threads as there are cores."""
-os.environ.update({f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")})
+ONE_THREAD = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")}
+os.environ.update(ONE_THREAD)
 
 
 def limit_renderer() -> None:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
 
-from tests.forked import run_forked
+from tests import forked
+from tests.forked import ROOT, run_forked
 
 TELLS = """
 import os, sys, threading
@@ -64,3 +68,28 @@ def test_after_a_script_that_does_not_end_the_next_one_has_its_own_answer(tmp_pa
         signal.setitimer(signal.ITIMER_REAL, *before[1])
     done = run_forked("tells.py", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (5, "told\n")
+
+
+def test_a_program_without_pytest_may_run_scripts_so(tmp_path: Path) -> None:
+    """Whose environment limits no library's threads, and whose scripts' own processes have this checkout, too."""
+    (tmp_path / "tells.py").write_text(
+        "import subprocess, sys; subprocess.run([sys.executable, '-c', 'import raytac; print(raytac.__file__)'])"
+    )
+    code = f"from pathlib import Path; from tests.forked import run_forked; print(run_forked('tells.py', cwd=Path({str(tmp_path)!r})))"
+    environment = {
+        name: value for name, value in os.environ.items() if name != "PYTHONPATH" and not name.endswith("_NUM_THREADS")
+    }
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "returncode=0" in done.stdout and str(ROOT / "raytac" / "__init__.py") in done.stdout
+
+
+def test_a_forked_process_that_has_ended_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    @cache
+    def ended() -> subprocess.Popen[str]:
+        command, pipe = [sys.executable, "-c", "raise SystemExit(3)"], subprocess.PIPE
+        return subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, start_new_session=True)
+
+    monkeypatch.setattr(forked, "_server", ended)
+    with pytest.raises(RuntimeError, match="the process that is forked ended with exit code 3"):
+        run_forked("tells.py", cwd=tmp_path)

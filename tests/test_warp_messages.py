@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import warp as wp
 
+from raytac.cli import main
 from raytac.cli.shared import SolverOptions
 from raytac.warp_messages import has_compiled_kernels
 
@@ -32,3 +33,28 @@ def test_the_command_says_once_that_kernels_are_compiled(
         (tmp_path / "wp_ipc.solver.pcg_0123456").mkdir()
         SolverOptions().prepare_warp(soft=True)
     assert has_compiled_kernels(solver=True) and len(caplog.records) == 2
+
+
+@pytest.mark.parametrize(
+    ("command", "soft"),
+    [
+        ("dataset demo", False),
+        ("dataset demo --physics ipc", True),
+        ("play scripted --task LiftCube", False),
+        ("play scripted --task LiftCube --physics ipc", True),
+        ("play push_cube_ppo", False),
+    ],
+)
+def test_a_command_asks_for_the_kernels_of_its_physics(
+    command: str, soft: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Asked(Exception):
+        pass
+
+    def prepare_warp(self: SolverOptions, *, soft: bool = False) -> None:
+        raise Asked(soft)
+
+    monkeypatch.setattr(SolverOptions, "prepare_warp", prepare_warp)
+    with pytest.raises(Asked) as asked:
+        main([*command.split(), "--out", str(tmp_path)])
+    assert asked.value.args == (soft,)

@@ -126,7 +126,11 @@ class BlockJacobi:
             self.affine.update(system, contacts, rows, self.inverse, active)
 
     def apply(self, r: wp.array, running: wp.array, z: wp.array) -> None:
-        """z = M⁻¹ r for the running environments; arrays (B, N) of vec3d."""
+        """z = M⁻¹ r for the running environments; arrays (B, N) of vec3d.
+
+        With lines :mod:`ipc.solver.pcg_serial` applies it instead.
+        """
+        assert self.lines is None, "with lines, inverse has the pivots of their factors, not inverses of diagonal blocks"
         wp.launch(apply_blocks, dim=r.shape, inputs=[self.inverse, r, running], outputs=[z], device=r.device)
         if self.affine:
             self.affine.finish(self.inverse, r, running, z)

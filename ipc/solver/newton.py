@@ -63,6 +63,7 @@ class Newton:
         if not self.device.is_cuda and self.pcg.is_in_one_block(self.preconditioner) and _is_held(layout):
             potential.use_halves()
             self.preconditioner.use_lines(layout, potential.where)
+            self.pcg.use_lines()
         self._still = wp.zeros_like(potential.x)
         self._friction = int(potential.collision.friction)
         self._renewals, self._calm_renewals = (_RENEWALS, 0) if _is_held(layout) else (0, _CALM_RENEWALS)

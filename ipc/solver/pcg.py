@@ -145,12 +145,20 @@ class Pcg:
         self._by_rows = wp.zeros((batch, -(-lanes // BLOCK)), dtype=wp.float64, device=device)
         self._running = wp.zeros(batch, dtype=wp.int32, device=device)
         self._any = wp.zeros(1, dtype=wp.int32, device=device)
-        self._vectors = Vectors() if device.is_cuda else make_vectors(batch, nodes, device)
+        self._vectors = Vectors()
         self.scalars = Scalars()
         self.scalars.rz = wp.zeros((2, batch), dtype=wp.float64, device=device)
         self.scalars.rr0 = wp.zeros(batch, dtype=wp.float64, device=device)
         self.scalars.iterations = wp.zeros(batch, dtype=wp.int32, device=device)
         self.scalars.negative = wp.zeros(batch, dtype=wp.int32, device=device)
+
+    def use_lines(self) -> None:
+        """Prepare for a preconditioner with lines alone (:mod:`ipc.solver.pcg_serial`).
+
+        The work space of the others is given back.
+        """
+        self._vectors = make_vectors(self.batch, self.nodes, self.device)
+        del self._p, self._Ap, self._z
 
     def is_in_one_block(self, preconditioner: Preconditioner) -> TypeGuard[BlockJacobi]:
         """True if :mod:`ipc.solver.pcg_block` solves with this preconditioner."""

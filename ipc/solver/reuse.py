@@ -35,11 +35,11 @@ def choose_stale(F: MatArray2d, project: IntArray, active: IntArray, filled_F: M
     if filled[env] != project[env]:
         most = wp.float64(wp.inf)
     for e in range(F.shape[1]):
-        if most > DEFORMED * DEFORMED:
+        if not (most <= DEFORMED * DEFORMED):  # greater or not a number
             break
         change = F[env, e] - filled_F[env, e]
         most = wp.ddot(change, change)
-    if most > DEFORMED * DEFORMED:
+    if not (most <= DEFORMED * DEFORMED):
         stale[env] = 1
         filled[env] = project[env]
         for e in range(F.shape[1]):

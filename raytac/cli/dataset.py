@@ -28,7 +28,7 @@ from raytac.io.images import write_png
 from raytac.io.metrics import versions, write_metrics
 from raytac.io.options import parse_names, parse_resolution
 from raytac.optics import OPTICS
-from raytac.physics import PHYSICS
+from raytac.physics import PHYSICS, Ipc
 from raytac.report.measure import machine
 from raytac.specs import SweepSpec, available, load_sweep
 
@@ -81,11 +81,11 @@ class DatasetArgs(SolverOptions):
 
     def run(self) -> int:
         start = time.perf_counter()
-        self.prepare_warp()
         out = self.folder("dataset")
         if self.verify:
             return self._verify(out)
         plan = DatasetPlan(self._asked())
+        self.prepare_warp(soft=isinstance(plan.physics, Ipc))
         if self.sheet < 0:
             raise InputError("sheet", value=self.sheet, rule="must be a whole number >= 0")
         if self.sheet and not {"rgb", "height"} & set(plan.sweep.outputs):

@@ -10,7 +10,7 @@ import tyro
 
 from raytac.cli.shared import SolverOptions, named, print_paths
 from raytac.optics import OPTICS
-from raytac.physics import PHYSICS
+from raytac.physics import PHYSICS, Ipc
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,8 +45,8 @@ class PlayArgs(SolverOptions):
         os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported, which is below
         from raytac.learn import find_player, play_policy
 
-        self.prepare_warp()
         player = find_player(self.policy, self.task)
+        self.prepare_warp(soft=isinstance(PHYSICS.config(self.physics or player.physics), Ipc))
         out = self.folder("play", player.name)
         metrics = play_policy(
             player,

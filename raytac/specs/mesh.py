@@ -26,6 +26,7 @@ SIZE_RANGE = (1e-4, 0.5)
 _LARGE_FILE = 10_000_000
 """Bytes from which reading a file shows its progress: 200,000 triangles of a binary STL."""
 _LOG = logging.getLogger("raytac")
+_Solid = tuple[np.ndarray, np.ndarray, list[str]]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -52,7 +53,8 @@ class TriangleMesh:
 def load_mesh(path: str | Path, scale: float, *, repair: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and faces of a closed surface.
 
-    A file that has not changed since is read, checked and repaired once. Of a large one, progress is shown on standard error.
+    A file that has not changed since is read, checked and repaired once; what the repair did is logged at every call. Of a large file,
+    progress is shown on standard error.
 
     Args:
         path: STL, OBJ, PLY, OFF or GLB file.
@@ -71,18 +73,25 @@ def load_mesh(path: str | Path, scale: float, *, repair: bool = False) -> tuple[
     _check_scale(scale, path)
     if not is_file(path):
         raise MeshError("the mesh file does not exist", file=path)
-    state = path.stat()
-    vertices, faces = _solid_of_file(path.absolute(), scale, repair, (state.st_ino, state.st_mtime_ns, state.st_size))
+    try:
+        state = path.stat()
+    except OSError as error:  # removed since
+        raise MeshError(f"the mesh file cannot be read ({type(error).__name__}: {error})", file=path) from error
+    vertices, faces, done = _solid_of_file(path, scale, repair, (state.st_dev, state.st_ino, state.st_mtime_ns, state.st_size))
+    _log(done, path)
     return vertices.copy(), faces.copy()
 
 
 @lru_cache(maxsize=2)
-def _solid_of_file(path: Path, scale: float, repair: bool, state: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Closed surface of a file, kept while ``state`` (inode, time, size) is the same."""
-    with Progress(desc=f"read {path.name}", total=2, unit="step", show=state[2] >= _LARGE_FILE, leave=False) as bar:
+def _solid_of_file(path: Path, scale: float, repair: bool, state: tuple[int, ...]) -> _Solid:
+    """Closed surface of a file, kept while ``state`` (device, inode, time, size) is the same.
+
+    ``path`` is as the caller gave it, for messages; the inode tells apart files that it means in different folders.
+    """
+    with Progress(desc=f"read {path.name}", total=2, unit="step", show=state[-1] >= _LARGE_FILE, leave=False) as bar:
         mesh = _read(path)
         bar.update()
-        solid = closed_mesh(mesh.vertices, mesh.faces, scale, file=path, repair=repair)
+        solid = _checked(mesh.vertices, mesh.faces, scale, path, repair)
         bar.update()
     return solid
 
@@ -108,6 +117,18 @@ def closed_mesh(
         MeshError: no faces, vertices that are not finite, a surface that is not watertight or not oriented the same way throughout,
             faces that look inwards, a rim that ``repair`` cannot close, or a size outside ``SIZE_RANGE``.
     """
+    vertices, faces, done = _checked(vertices, faces, scale, file, repair)
+    _log(done, file)
+    return vertices, faces
+
+
+def _log(done: list[str], file: Path | None) -> None:
+    for text in done:
+        _LOG.warning("%s: %s", file or "mesh", text)
+
+
+def _checked(vertices: Any, faces: Any, scale: float, file: Path | None, repair: bool) -> _Solid:
+    """Vertices and faces of ``closed_mesh``, and what its repair did."""
     _check_scale(scale, file)
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
     if not len(vertices) or not len(faces):
@@ -124,8 +145,6 @@ def closed_mesh(
     if repair:
         mesh, done = _repaired(mesh, scale, file)
     _require_solid(mesh, file, tried=repair)
-    for text in done:
-        _LOG.warning("%s: %s", file or "mesh", text)
     extent = float(np.ptp(mesh.vertices, axis=0).max()) * scale
     if not SIZE_RANGE[0] <= extent <= SIZE_RANGE[1]:
         low, high = (1e3 * s for s in SIZE_RANGE)
@@ -135,7 +154,7 @@ def closed_mesh(
         if other is not None and SIZE_RANGE[0] <= extent * other / scale <= SIZE_RANGE[1]:
             rule += f"; try {other:g} for a file in {'metres' if other == 1.0 else 'millimetres'}"
         raise MeshError(rule, file=file, key="scale", value=scale)
-    return np.asarray(mesh.vertices, np.float64) * scale, np.asarray(mesh.faces, np.int32)
+    return np.asarray(mesh.vertices, np.float64) * scale, np.asarray(mesh.faces, np.int32), done
 
 
 def _check_scale(scale: float, file: Path | None) -> None:

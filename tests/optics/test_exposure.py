@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import warnings
 from dataclasses import replace
@@ -22,7 +23,7 @@ from raytac.optics.response import mid_grey_exposure
 from raytac.optics.taxim.bake import bake
 from raytac.optics.trace.fast_tracer import with_exposure
 from raytac.specs import SensorSpec, load_sensor
-from raytac.specs.sensor import AUTO
+from raytac.specs.sensor import AUTO, LightsSpec, RefractionSpec
 from raytac.specs.sensor_file import response_text
 from tests.optics.scenes import RESOLUTION, built, grid_of, like_a_mini
 from tests.optics.test_taxim_mode import make_table
@@ -88,6 +89,25 @@ def test_a_white_image_at_rest_is_told_of_once_with_the_exposure_that_mends_it(i
         warnings.simplefilter("error")
         rgb = at_rest(built(RayTraced, exposed(float(match[2])), integrator="fast", **COMMON))
     assert rgb.mean((0, 1)).max() == pytest.approx(127.5, abs=1.0 if integrator == "fast" else 5.0)
+
+
+@pytest.mark.parametrize("kind", ["dome", "one layer", "slab", "monochrome", "lens"])
+def test_sensors_of_every_kind_are_told_of_if_they_are_white(kind: str) -> None:
+    """Other files of this folder leave the warning out."""
+    sensor = replace(WHITE, gelpad=replace(WHITE.gelpad, dome_radius=(30e-3, 25e-3) if kind == "dome" else (math.inf, math.inf)))
+    if kind == "one layer":
+        sensor = replace(sensor, lights=LightsSpec(tuple(replace(led, layer="all") for led in sensor.lights.leds)))
+    elif kind == "slab":
+        sensor = replace(sensor, refraction=RefractionSpec("slab", 1.41, 0.5e-3))
+    elif kind in ("monochrome", "lens"):
+        changes: dict[str, Any] = {"monochrome": True} if kind == "monochrome" else {"distortion": (0.05, 0.0, 0.0, 0.0)}
+        sensor = replace(sensor, camera=replace(sensor.camera, **changes))
+    for exposure, count in ((1e4, 1), (1e-3, 0)):
+        tracer = built(RayTraced, replace(sensor, response=replace(sensor.response, exposure=exposure)), **COMMON)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            tracer.prepare(grid_of(sensor))
+        assert len(told(caught)) == count
 
 
 def test_a_sensor_that_is_not_white_is_not_told_of() -> None:

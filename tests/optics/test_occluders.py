@@ -32,9 +32,11 @@ SPECS = {
 
 
 def pressed(spec: SensorSpec, shape: str) -> np.ndarray:
-    """Heights (Ny, Nx) [m] of pillars on the gel at rest, or on one with a dent and a bulge."""
+    """Heights (Ny, Nx) [m] of one pillar or of several on the gel at rest, or of several on one with a dent and a bulge."""
     grid, rng = grid_of(spec), np.random.default_rng(5)
     x, y = grid.x[None, :], grid.y[:, None]
+    if shape == "one pillar":
+        return grid.rest - np.where((np.abs(x - 6e-3) < 0.7e-3) & (np.abs(y) < 0.7e-3), 1e-3, 0.0)
     depth = np.zeros(grid.shape)
     for _ in range(6):
         at, half = rng.uniform(-7e-3, 7e-3, 2), rng.uniform(0.4e-3, 0.9e-3)
@@ -73,7 +75,7 @@ def prepared(tracer: Build, name: str) -> Any:
     return mode
 
 
-@pytest.mark.parametrize("shape", ["pillars", "bulge"])
+@pytest.mark.parametrize("shape", ["one pillar", "pillars", "bulge"])
 @pytest.mark.parametrize("name", SPECS)
 def test_what_is_left_out_sees_all_of_its_led(
     tracer: Build, monkeypatch: pytest.MonkeyPatch, spans: list[list[np.ndarray]], name: str, shape: str
@@ -91,9 +93,10 @@ def test_what_is_left_out_sees_all_of_its_led(
     expected = shares(mode, height)
     assert expected.min() < 0.5, "no shadow"
     np.testing.assert_allclose(found, expected, atol=1e-6)
-    skipped = np.mean([span[:, 0] > span[:, 1] for span in spans[0]])
-    # Behind a dome that falls off as steeply as light arrives, gel that is touched may shade anything, and so does what bulges.
-    assert skipped > (0.05 if shape == "pillars" and name != "domed" else -1), f"only {skipped:.1%} of the blocks are left out"
+    # What bulges may shade anything, and so may gel that is touched in many places of a dome that falls off as steeply as light arrives.
+    if shape == "one pillar" or (shape == "pillars" and name != "domed"):
+        skipped = np.mean([span[:, 0] > span[:, 1] for span in spans[0]])
+        assert skipped > 0.05, f"only {skipped:.1%} of the blocks are left out"
 
 
 @pytest.mark.parametrize("name", SPECS)

@@ -150,6 +150,13 @@ def test_turn_and_shear_by_environment_are_those_of_scenes_of_their_own():
     assert state.normal_force[1] < 0.5 * state.normal_force[0]  # on its rim
 
 
+def test_a_shear_in_one_step_has_the_friction_of_four():
+    """A flat face, whose slow modes conjugate gradients reach last: ended by ‖r‖ alone, one step lost 5 % of its friction."""
+    scene = press(indent(0.4e-3), StageSpec("shear", shear=(0.1e-3, 0.0)), kind="cylinder")
+    one, four = (list(uncorrected(scene, level=COARSE).run(states))[-1].shear_force[0, 0] for states in (1, 4))
+    assert four > 0.3 and one == pytest.approx(four, rel=0.01)
+
+
 def test_every_environment_has_its_depth():
     depths = np.array([0.2e-3, 0.4e-3])
     pad = uncorrected(press(indent(0.3e-3)), num_envs=2, depths=depths)

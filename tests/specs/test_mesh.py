@@ -247,6 +247,42 @@ def test_a_mesh_inside_out_is_turned_and_a_sound_one_kept(tmp_path: Path, caplog
     assert not caplog.records
 
 
+def test_every_load_tells_of_the_repair_by_the_path_as_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A file is read once; what is said of it does not depend on who read it before."""
+    monkeypatch.chdir(tmp_path)
+    path = Path("open.stl")
+    path.write_bytes(stl(CUBE.triangles[1:]))
+    for _ in range(2):
+        with pytest.raises(MeshError, match="watertight") as caught:
+            load_mesh(path, 0.001)
+        assert caught.value.file == path
+    spellings = [path, path, path.absolute(), path]
+    for given_as in spellings:
+        load_mesh(given_as, 0.001, repair=True)
+    lines = [record.getMessage() for record in caplog.records]
+    assert [line.partition(": closed 1 hole")[0] for line in lines] == [str(each) for each in spellings]
+
+
+def test_the_same_relative_path_in_another_folder_is_another_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, scale in (("a", 1.0), ("b", 2.0)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "cube.stl").write_bytes(stl(scale * CUBE.triangles))
+        os.utime(tmp_path / name / "cube.stl", ns=(0, 0))
+    lengths = []
+    for name in "ab":
+        monkeypatch.chdir(tmp_path / name)
+        lengths.append(np.ptp(load_mesh("cube.stl", 0.001)[0][:, 0]))
+    assert lengths == pytest.approx([10e-3, 20e-3])
+
+
+def test_a_file_that_vanishes_while_it_is_asked_for_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("raytac.specs.mesh.is_file", lambda path: True)
+    with pytest.raises(MeshError, match=r"cannot be read \(FileNotFoundError"):
+        load_mesh(tmp_path / "gone.stl", 0.001)
+
+
 def test_what_cannot_be_closed_is_refused(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     triangles = np.array(CUBE.triangles)
     triangles[3] = triangles[3, ::-1]

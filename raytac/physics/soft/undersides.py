@@ -36,7 +36,8 @@ class Undersides:
     """Lowest z of objects above each node of one grid.
 
     Attributes:
-        under: [m], (B, Ny, Nx), float64, inf where there is none.
+        under: [m], (B, Ny, Nx), float64, inf where there is none. Never −inf: shapes are bounded, but for half-spaces, which have an
+            underside only where they look down.
     """
 
     def __init__(self, grid: PadGrid, below: float, num_envs: int, device: Any) -> None:

@@ -19,8 +19,11 @@ from raytac.physics.soft.mesh import PadLevel, pad_mesh
 from raytac.physics.soft.reading import SoftReader
 from raytac.physics.soft.scene import SoftScene
 from raytac.physics.soft.settings import Correction
+from raytac.physics.soft.undersides import Touched, Undersides
+from raytac.se3 import rotations
 from raytac.shapes.part import primitive
 from raytac.specs import load_sensor
+from tests.physics.rigid.test_pad_search import KINDS, body_of
 from tests.physics.soft.oracles import reading as oracle
 from tests.physics.soft.oracles.traction import CoatTraction as OracleTraction
 
@@ -227,3 +230,28 @@ def test_traction_and_markers_are_those_of_numpy(device):
     markers = CoatMarkers(mesh, places, 2, device)
     followed = markers.launch(wp.array(coat, dtype=wp.vec3d, device=device)).numpy()
     assert np.abs(followed - tracked[..., :2]).max() < 1e-10 and np.abs(followed).max() > 5e-5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_underside_is_infinitely_low(kind: str) -> None:
+    """Heights are laid on whatever is less than inf. Turns are random, upright to rounding and nearly so."""
+    count, rng = 40, np.random.default_rng(7)
+    quarter = np.array([[0.5 * np.pi, 0.0, 0.0], [0.0, 0.5 * np.pi, 0.0], [0.0, -0.5 * np.pi, 0.0], [np.pi, 0.0, 0.0]])
+    turns = np.concatenate([rng.normal(size=(20, 3)), np.tile(quarter, (5, 1))])
+    turns[24:] += 10.0 ** rng.integers(-16, -2, (16, 1)) * rng.normal(size=(16, 3))
+    poses = np.tile(np.eye(4), (count, 1, 1, 1))
+    poses[:, 0, :3, :3] = rotations(turns)
+    poses[:, 0, :3, 3] = rng.uniform(-2e-3, 2e-3, (count, 3))
+    everywhere = wp.ones((count, 1), dtype=wp.bool, device="cpu")
+    objects = Touched(
+        (body_of(kind, rng),),
+        wp.array(poses, dtype=wp.mat44d, device="cpu"),
+        everywhere,
+        wp.ones(1, dtype=wp.float64, device="cpu"),
+        (),
+    )
+    under = Undersides(GRID, 5e-3, count, "cpu")
+    under.find(objects, wp.ones(count, dtype=wp.int32, device="cpu"), wp.zeros(count, dtype=wp.float64, device="cpu"))
+    lowest = under.under.numpy()
+    assert np.isfinite(lowest).any()
+    assert (lowest > -np.inf).all()

@@ -117,6 +117,7 @@ def overlaps(
 ):  # fmt: skip
     """Overlap of the coat without normal contact [m], by (environment, row).
 
+    ``under`` is finite, or inf where there is no object, as of ``Undersides``.
     ``near``: columns, from and to, of the row's nodes that may touch.
     """
     env, row = wp.tid()
