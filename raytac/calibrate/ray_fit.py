@@ -14,10 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from raytac.calibrate.camera_view import with_view
 from raytac.calibrate.direct_fit import REST_FACTOR, SIGMA, DirectFit, FitSettings, FitState
 from raytac.calibrate.direct_light import ExtraLight, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
-from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LENGTH, SHORTEST, LightParameters, with_parameters, with_view
+from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LENGTH, SHORTEST, LightParameters, with_parameters
 from raytac.calibrate.photographs import Photographs, decode
 from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid, make_grid
@@ -77,7 +78,7 @@ def first_state(sensor: SensorSpec, shots: Photographs, settings: FitSettings, s
 
 def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, tracing: RayTraced) -> Light:
     """Light of LEDs at power 1 that the ray tracer adds to direct light, at the fit's pixels."""
-    sensor, p = with_view(problem.sensor, state.p), state.p
+    sensor, p = with_view(problem.sensor, state.p.view), state.p
     unit = dataclasses.replace(p, power=np.ones_like(p.power))
     lit = dataclasses.replace(sensor, lights=unit.lights(sensor))
     height, width = problem.shape
