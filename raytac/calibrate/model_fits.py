@@ -160,7 +160,9 @@ def fit_models(
         elif name == "taxim":
             table = fit_table(sensor, background, samples)
             if shadow_table == "raytrace":
-                table = with_cast_shadows(table, fitted.sensor, device=device, seed=seed, tick=count_rendered)
+                # Pixels of the table are those of the given camera, and so are its shadows'.
+                lit = dataclasses.replace(fitted.sensor, camera=sensor.camera)
+                table = with_cast_shadows(table, lit, device=device, seed=seed, tick=count_rendered)
             built[name] = Taxim(table, shadows=table.shadow is not None).build(sensor, device=device)
         elif name == "mlp":
             built[name] = Mlp(fit_mlp(sensor, background, samples, seed=seed)).build(sensor, device=device)
