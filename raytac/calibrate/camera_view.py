@@ -82,7 +82,7 @@ class ViewBounds:
         self.distance, self.distortion = map(float, start)
         self.most_k1 = max(MOST_K1, abs(with_view(sensor, start).camera.distortion[0]))
         self._is_valid = lru_cache(4096)(self._is_valid)
-        self._distances = lru_cache(2)(self._distances)
+        self.distances = lru_cache(2)(self.distances)
         self._last_distortion = lru_cache(4096)(self._last_distortion)
 
     def inside(self, view: np.ndarray, fixed: tuple[str, ...], room: tuple[float, float, float, float]) -> np.ndarray:
@@ -92,7 +92,7 @@ class ViewBounds:
         """
         distance, distortion = map(float, view)
         if "distance" not in fixed:
-            low, high = self._distances("distortion" in fixed)
+            low, high = self.distances("distortion" in fixed)
             distance = min(max(distance, low), high)
         if "distortion" not in fixed:
             most = most_distorted(self.sensor, distance)
@@ -119,8 +119,8 @@ class ViewBounds:
         beside = [5e2 * size + 1e3 * out for size, (low, high) in sides for out in (low, -high)]
         return all(width >= need for width, need in zip(beside, room, strict=True) if need)
 
-    def _distances(self, keeps_distortion: bool) -> tuple[float, float]:
-        """Range of the distance [mm] about that of the start."""
+    def distances(self, keeps_distortion: bool) -> tuple[float, float]:
+        """Range of a fitted distance [mm], with the start's distortion kept or fitted too."""
 
         def is_valid(distance: float) -> bool:
             return self._is_valid(distance, self.distortion if keeps_distortion else self._begin(distance), (0.0,) * 4)

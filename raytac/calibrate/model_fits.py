@@ -15,7 +15,7 @@ from raytac.calibrate.image_fits import fit_mlp, fit_table, press_samples, with_
 from raytac.calibrate.imprint import press_surface
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.prior_choice import STRENGTHS, choose_strength
-from raytac.calibrate.ray_fit import Fitted, fit_lights, refine_circles
+from raytac.calibrate.ray_fit import Fitted, check_fitted, fit_lights, refine_circles
 from raytac.checks import check_whole
 from raytac.device import DEVICES
 from raytac.errors import InputError
@@ -156,6 +156,7 @@ def fit_models(
             built[name] = raytrace_mode(fitted.sensor, background, device, tracing)
         elif name == ALONE:
             shaded = with_shading(fitted.sensor, background, device=device, tracing=tracing)
+            check_fitted(shaded)
             built[name] = tracing.build(shaded, resolution=(background.shape[1], background.shape[0]), device=device)
         elif name == "taxim":
             table = fit_table(sensor, background, samples)

@@ -13,6 +13,7 @@ from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
 from raytac.calibrate.imprint import RIGID_PAD
 from raytac.calibrate.light_parameters import LightParameters, with_parameters
 from raytac.calibrate.photographs import Photographs
+from raytac.calibrate.ray_fit import check_fitted, fit_lights
 from raytac.calibrate.start import leds_at_walls, leds_in_rows
 from raytac.errors import InputError
 from raytac.specs import SensorSpec, load_sensor, with_lights
@@ -112,3 +113,33 @@ def test_a_camera_whose_view_stays_keeps_its_numbers(name: str) -> None:
     grey = np.full((8, 8, 3), 100.0)
     p = LightParameters.of(sensor, grey)
     assert with_parameters(sensor, p, grey).camera == sensor.camera
+
+
+@pytest.mark.parametrize("at_bound", [True, False])
+def test_a_distance_that_ends_at_its_bound_is_logged(
+    at_bound: bool, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The end of the solver is given here; the warning says where it lies and what to do."""
+    mini = load_sensor("gelsight_mini")
+    at = circles(8)
+    blank = Photographs(np.full((240, 320, 3), 90.0), np.full((8, 240, 320, 3), 90.0), at, np.full(8, 3.155e-3))
+    distance = 28.0 * (2.5 if at_bound else 1.2)
+
+    def solve(problem: DirectFit, state: FitState, *_: object) -> tuple[DirectFit, FitState]:
+        view = np.array([distance, 0.0])
+        return problem, problem.inside_bounds(dataclasses.replace(state, p=dataclasses.replace(state.p, view=view)))
+
+    monkeypatch.setattr("raytac.calibrate.ray_fit.solve_direct", solve)
+    with caplog.at_level("WARNING", "raytac"):
+        fitted = fit_lights(mini, blank, settings=FitSettings(fixed=("tone", "mix")), rounds=0, starts=1, device="cpu")
+    assert fitted.state.p.view[0] == pytest.approx(distance)
+    said = "the camera's distance ended at its bound, 70 mm (start 28 mm)" in caplog.text and "fix 'distance'" in caplog.text
+    assert said == at_bound
+
+
+def test_a_fit_that_ends_in_no_sensor_says_what_to_do() -> None:
+    mini = load_sensor("gelsight_mini")
+    check_fitted(mini)
+    camera = dataclasses.replace(mini.camera, distortion=(-0.9, 0.0, 0.0, 0.0))
+    with pytest.raises(InputError, match=r"camera\.distortion = .*inverse.*begin with other lights"):
+        check_fitted(dataclasses.replace(mini, camera=camera))
