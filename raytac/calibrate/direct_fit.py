@@ -18,10 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from raytac.calibrate.camera_view import ViewBounds, check_view, with_view
 from raytac.calibrate.direct_light import ExtraLight, LedLight, Light, case_light, led_light
 from raytac.calibrate.imprint import PixelGeometry, pixel_geometry
 from raytac.calibrate.light_parameters import (
-    CLOSER,
     DARKEST,
     HEIGHT,
     LENGTH,
@@ -35,9 +35,8 @@ from raytac.calibrate.light_parameters import (
     least_mix,
     leds_inside,
     mean_power,
-    most_distorted,
+    room_beside_view,
     side_ties,
-    with_view,
 )
 from raytac.calibrate.photographs import Photographs, decode, encode, level_slope
 from raytac.optics.trace.quadrature import EdgePoints
@@ -134,12 +133,14 @@ class DirectFit:
     ) -> None:
         """``factor``² pixels are averaged to one; ``start`` is the prior of lights and imprint.
 
-        Raises InputError: a colour matrix that is fitted and does not begin inside its bounds.
+        Raises InputError: a colour matrix, tone curve or distortion that is fitted and does not begin inside its bounds.
         """
         if "mix" not in settings.fixed:
             check_mix(sensor, start.p)
         if "tone" not in settings.fixed:
             check_tone(start.p)
+        if "distortion" not in settings.fixed:
+            check_view(sensor, start.p.view)
         self.sensor, self.shots, self.start, self.settings = sensor, shots, start, settings
         small, coarse = shots.shrunk(factor), shots.shrunk(REST_FACTOR)
         height, width = small.background.shape[:2]
@@ -167,6 +168,7 @@ class DirectFit:
         self.circle_sigma = CIRCLE_SIGMA * native[0] * wider
         self.ties = side_ties(start.p, len(self.flat(start)))
         self.anchor, self.hold = self.flat(start), 0.0
+        self.views = ViewBounds(sensor, start.p.view)
 
     def with_points(self, points: tuple[EdgePoints, ...]) -> DirectFit:
         """The same problem with ``points`` on its LEDs.
@@ -205,7 +207,7 @@ class DirectFit:
         return stiff / self.sigma(state.p) ** 2
 
     def _geometry(self, state: FitState, u: np.ndarray, v: np.ndarray, press: np.ndarray) -> PixelGeometry:
-        own = with_view(self.sensor, state.p)
+        own = with_view(self.sensor, state.p.view)
         return pixel_geometry(own, u, v, press, state.circles, self.shots.radius, state.slopes)
 
     def geometry(self, state: FitState) -> PixelGeometry:
@@ -300,7 +302,7 @@ class DirectFit:
     def inside_bounds(self, state: FitState) -> FitState:
         """Every parameter moved to what a sensor accepts (``leds_inside``).
 
-        LEDs are moved as a whole; of the other blocks, those that are fixed stay.
+        LEDs are moved as a whole, virtual ones beside the view; of the other blocks, those that are fixed stay.
         """
         p, response = state.p, state.p.response.copy()
 
@@ -308,16 +310,15 @@ class DirectFit:
             return values if name in self.settings.fixed else np.clip(values, least, most)
 
         length, height = self.sees_sizes()
+        room = room_beside_view(self.sensor, p, lengths=length, heights=height)
+        p = dataclasses.replace(p, view=self.views.inside(p.view, self.settings.fixed, room))
         leds = leds_inside(self.sensor, p, lengths=length, heights=height)
         response[:1], response[1:4] = bounded("gamma", response[:1], 1.0, 2.4), bounded("stray", response[1:4], 0, DARKEST)
         response[4:5] = bounded("vignette", response[4:5], -2.0, 0.5)
         response[5:] = bounded("vignette", response[5:], max(-0.3, -0.75 - response[4]), 1.5)
         power, glow = bounded("power", p.power, 0, None), bounded("glow", p.glow, 0, None)
         mix, tone = bounded("mix", p.mix, least_mix(self.sensor), 0), bounded("tone", p.tone, -MOST_BENT, MOST_BENT)
-        distance = bounded("distance", p.view[:1], *(c * self.start.p.view[0] for c in CLOSER))
-        most = most_distorted(self.sensor, dataclasses.replace(p, view=np.append(distance, 0.0)))
-        view = np.append(distance, bounded("distortion", p.view[1:], -most, most))
-        changed = LightParameters(p.template, leds, power, glow, response, mix, tone, view)
+        changed = LightParameters(p.template, leds, power, glow, response, mix, tone, p.view)
         circles = state.circles.copy()
         circles[:, 2] = np.clip(circles[:, 2], 3, None)
         return FitState(changed, state.slopes, circles)
@@ -498,13 +499,14 @@ class DirectFit:
         """Motion (n, n) of all parameters by each that is ``free``.
 
         All move by their own change, and those ``stuck`` at a bound with it: what an LED reaches depends on its size and aim, and with that
-        the places where its middle may lie.
+        the places where its middle may lie; those of virtual sources depend on the view too.
         """
         motion, circles = np.eye(len(x)), self.start.circles
         if not stuck.any():
             return motion
         beyond = x - 1e3 * STEP * np.sign(slope) * stuck
-        for k in np.flatnonzero(free[: self.start.p.leds.size]):
+        after = len(x) - len(self.start.slopes)
+        for k in (*np.flatnonzero(free[: self.start.p.leds.size]), *(after - 2 + np.flatnonzero(free[after - 2 : after]))):
             ends = [self.flat(self.inside_bounds(self.at(beyond + sign * STEP * np.eye(len(x))[k], circles))) for sign in (1, -1)]
             motion[stuck, k] = ((ends[0] - ends[1]) / (2 * STEP))[stuck]
         return motion

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from raytac.calibrate.camera_view import ROUNDED, view_of, with_view
 from raytac.calibrate.photographs import decode
 from raytac.errors import InputError
 from raytac.optics.trace.quadrature import EdgePoints, quadrature
 from raytac.specs import LedSpec, LightsSpec, SensorSpec
-from raytac.specs.sensor import CameraSpec
 from raytac.specs.sensor_check import view_edges
 from raytac.specs.tone import STRAIGHT, ToneCurve
 
@@ -41,14 +41,8 @@ GAP = 0.02
 MOST_MIXED = -0.5
 """Least number of a fitted colour matrix off its diagonal (a guess); the most is 0.
 Both are for light in full scales. Light of several channels from one LED is in its powers."""
-ROUNDED = 1e-3
-"""Most that a matrix may begin beyond these bounds: that of a file is rounded."""
 MOST_BENT = np.array([0.4, 0.1, 0.4])
 """Most of the size of a fitted tone curve's coefficients: with them every curve rises."""
-CLOSER = 0.6, 2.5
-"""Range of a fitted distance from pinhole to pad, over that of the start (a guess)."""
-MOST_DISTORTED, MOST_K1 = 0.1, 1.9
-"""Most of the size of a fitted distortion (a guess), and of its k1."""
 OFF_DIAGONAL = ~np.eye(3, dtype=bool)
 REFERENCE_DISTANCE = 10e-3
 """Distance [m] at which a power of 1 gives a coat facing the LED full scale."""
@@ -74,8 +68,7 @@ class LightParameters:
     tone: np.ndarray
     """(3,): coefficients of the tone curve."""
     view: np.ndarray
-    """(2,): distance of the pinhole from z = 0 [mm], and radial distortion k1 r² half an image
-    from the middle along its longer side."""
+    """(2,): distance [mm] and distortion of ``camera_view``."""
 
     @classmethod
     def of(cls, sensor: SensorSpec, background: np.ndarray) -> LightParameters:
@@ -102,9 +95,7 @@ class LightParameters:
         glow = [max((led.glow for led in sensor.lights.leds if led.layer == c), default=0.0) * _GLOW for c in CHANNELS]
         a1, a2, _ = response.vignetting
         at_response, mix = np.array([response.gamma, *stray, a1, a2]), np.array(response.colour_mix) * _mixed_balance(sensor)
-        camera = sensor.camera
-        view = np.array([-1e3 * camera.position[2], camera.distortion[0] * _half_view(camera) ** 2])
-        return cls(sensor.lights, np.array(leds), np.array(power), np.array(glow), at_response, mix, tone, view)
+        return cls(sensor.lights, np.array(leds), np.array(power), np.array(glow), at_response, mix, tone, view_of(sensor))
 
     @property
     def mixing(self) -> np.ndarray:
@@ -203,25 +194,6 @@ def check_tone(p: LightParameters) -> None:
         raise InputError("response.tone", value=tuple(float(f"{t:.4g}") for t in p.tone), rule=rule)
 
 
-def _half_view(camera: CameraSpec) -> float:
-    """Slope that half the image's longer side is in units of the focal length."""
-    return 0.5 * max(n / f for n, f in zip(camera.resolution, camera.focal, strict=True))
-
-
-def most_distorted(sensor: SensorSpec, p: LightParameters) -> float:
-    """Most of the size of a fitted distortion at the fitted distance."""
-    half = _half_view(sensor.camera) * -1e3 * sensor.camera.position[2] / float(p.view[0])
-    return min(MOST_DISTORTED, MOST_K1 * half**2)
-
-
-def with_view(sensor: SensorSpec, p: LightParameters) -> SensorSpec:
-    """The sensor whose camera has the fitted view: the same pixel pitch at another distance."""
-    camera, (distance, distortion) = sensor.camera, map(float, p.view)
-    moved = dataclasses.replace(camera, position=(*camera.position[:2], -1e-3 * distance))
-    k1 = distortion / _half_view(moved) ** 2
-    return dataclasses.replace(sensor, camera=dataclasses.replace(moved, distortion=(k1, *camera.distortion[1:])))
-
-
 def mean_power(p: LightParameters) -> float:
     """Mean over LEDs of their power in the channel that they light most [full scales]."""
     return max(float(p.power.max(1).mean()), 1e-6)
@@ -242,7 +214,7 @@ def with_parameters(sensor: SensorSpec, p: LightParameters, background: np.ndarr
         colour_mix=mix,
         tone=tuple(map(float, p.tone)) if p.tone.any() else (),
     )
-    return dataclasses.replace(with_view(sensor, p), response=response, lights=p.lights(sensor))
+    return dataclasses.replace(with_view(sensor, p.view), response=response, lights=p.lights(sensor))
 
 
 def darkest(background: np.ndarray, gamma: float, curve: ToneCurve = STRAIGHT) -> np.ndarray:
@@ -352,15 +324,37 @@ def _beside_view(sensor: SensorSpec, p: LightParameters) -> tuple[np.ndarray, np
     """Least and largest x and y [mm] of what LEDs reach, (L, 2) each."""
     half = 5e2 * np.array(sensor.case.size)
     low, high = (np.tile(sign * half, (len(p.leds), 1)) for sign in (-1, 1))
-    places = np.array([led.position for led in p.template.leds])
-    x_edges, y_edges = view_edges(sensor)
-    for k in np.flatnonzero(p.virtual):
-        x, y = places[k, :2]
-        beyond = [(x_edges[0] - x, 0, high, x_edges[0]), (x - x_edges[1], 0, low, x_edges[1])]
-        beyond += [(y_edges[0] - y, 1, high, y_edges[0]), (y - y_edges[1], 1, low, y_edges[1])]
-        _, axis, bound, edge = max(beyond, key=lambda side: side[0])
-        bound[k, axis] = 1e3 * edge
+    edges = 1e3 * np.array(view_edges(with_view(sensor, p.view)))
+    for k, (axis, end) in _sides(sensor, p).items():
+        (high, low)[end][k, axis] = edges[axis, end]
     return low, high
+
+
+def _sides(sensor: SensorSpec, p: LightParameters) -> dict[int, tuple[int, int]]:
+    """Side of the given view on which every virtual source begins, by its index.
+
+    A side is its axis, 0 or 1, and 0 for its low end or 1 for its high one.
+    """
+    sides, edges = {}, view_edges(sensor)
+    for k in map(int, np.flatnonzero(p.virtual)):
+        place = p.template.leds[k].position
+        beyond = {(axis, end): sign * (place[axis] - edges[axis][end]) for axis in (0, 1) for end, sign in enumerate((-1, 1))}
+        sides[k] = max(beyond, key=lambda side: beyond[side])
+    return sides
+
+
+def room_beside_view(
+    sensor: SensorSpec, p: LightParameters, *, lengths: np.ndarray, heights: np.ndarray
+) -> tuple[float, float, float, float]:
+    """Width [mm] that virtual sources need, turned anyhow, beside the view.
+
+    At low x, high x, low y and high y; 0 for none. Sizes can shrink where ``lengths`` and ``heights`` (L,) are true.
+    """
+    length, height = np.where(lengths, SHORTEST, p.leds[:, LENGTH]), np.where(heights, HEIGHTS[0], p.leds[:, HEIGHT])
+    room = [0.0] * 4
+    for k, (axis, end) in _sides(sensor, p).items():
+        room[2 * axis + end] = max(room[2 * axis + end], 2 * GAP + float(np.hypot(length[k], height[k])))
+    return room[0], room[1], room[2], room[3]
 
 
 def _edges(leds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ from raytac.calibrate.image_fits import fit_mlp, fit_table, press_samples, with_
 from raytac.calibrate.imprint import press_surface
 from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.prior_choice import STRENGTHS, choose_strength
-from raytac.calibrate.ray_fit import Fitted, fit_lights, refine_circles
+from raytac.calibrate.ray_fit import Fitted, check_fitted, fit_lights, refine_circles
 from raytac.checks import check_whole
 from raytac.device import DEVICES
 from raytac.errors import InputError
@@ -156,11 +156,14 @@ def fit_models(
             built[name] = raytrace_mode(fitted.sensor, background, device, tracing)
         elif name == ALONE:
             shaded = with_shading(fitted.sensor, background, device=device, tracing=tracing)
+            check_fitted(shaded)
             built[name] = tracing.build(shaded, resolution=(background.shape[1], background.shape[0]), device=device)
         elif name == "taxim":
             table = fit_table(sensor, background, samples)
             if shadow_table == "raytrace":
-                table = with_cast_shadows(table, fitted.sensor, device=device, seed=seed, tick=count_rendered)
+                # Pixels of the table are those of the given camera, and so are its shadows'.
+                lit = dataclasses.replace(fitted.sensor, camera=sensor.camera)
+                table = with_cast_shadows(table, lit, device=device, seed=seed, tick=count_rendered)
             built[name] = Taxim(table, shadows=table.shadow is not None).build(sensor, device=device)
         elif name == "mlp":
             built[name] = Mlp(fit_mlp(sensor, background, samples, seed=seed)).build(sensor, device=device)

@@ -9,22 +9,25 @@ that the ray tracer takes on each LED at the round's beginning.
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from raytac.calibrate.camera_view import with_view
 from raytac.calibrate.direct_fit import REST_FACTOR, SIGMA, DirectFit, FitSettings, FitState
 from raytac.calibrate.direct_light import ExtraLight, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
-from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LENGTH, SHORTEST, LightParameters, with_parameters, with_view
+from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LENGTH, SHORTEST, LightParameters, with_parameters
 from raytac.calibrate.photographs import Photographs, decode
-from raytac.errors import InputError
+from raytac.errors import InputError, SpecError
 from raytac.gel.surface import GelSurface, PadGrid, make_grid
 from raytac.optics.base import casts_shadows
 from raytac.optics.trace.config import RayTraced
 from raytac.optics.trace.shadow import EXTENDED, angle
 from raytac.specs import SensorSpec
+from raytac.specs.sensor_check import validate_sensor
 
 GRID_PITCH = 0.12e-3
 """Spacing of the pad's nodes [m] while fitting."""
@@ -46,6 +49,9 @@ HOLD, HOLD_FACTOR = 1000.0, 8.0
 Rounds that make the cost worse raise it by the factor, others lower it (Levenberg and Marquardt's rule, between rounds)."""
 ENVS = 16
 """Presses in one call of the ray tracer."""
+_LOG = logging.getLogger("raytac")
+_AT_BOUND = 1e-4
+"""Part of the distance within which it counts as being at a bound."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +83,7 @@ def first_state(sensor: SensorSpec, shots: Photographs, settings: FitSettings, s
 
 def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, tracing: RayTraced) -> Light:
     """Light of LEDs at power 1 that the ray tracer adds to direct light, at the fit's pixels."""
-    sensor, p = with_view(problem.sensor, state.p), state.p
+    sensor, p = with_view(problem.sensor, state.p.view), state.p
     unit = dataclasses.replace(p, power=np.ones_like(p.power))
     lit = dataclasses.replace(sensor, lights=unit.lights(sensor))
     height, width = problem.shape
@@ -148,8 +154,8 @@ def fit_lights(
     ``start``: where the fit begins; None is ``first_state``. ``rounds`` of defect correction follow the fit of direct light; 0 leaves it
     at that. Direct light is fitted from ``starts`` places, the given one and others about it, and the best goes on. ``seed`` chooses
     pixels and places. ``tick`` is called with the stage and the cost after every step. Raises InputError: refraction, a camera with
-    tilt or without colours, LEDs of no colour, a colour matrix outside its bounds that is not fixed, or fewer values than
-    parameters; BackendError: the ray tracer cannot run on ``device``.
+    tilt or without colours, LEDs of no colour, a colour matrix, tone curve or distortion outside its bounds that is not fixed,
+    fewer values than parameters, or an end that no sensor file may hold; BackendError: the ray tracer cannot run on ``device``.
     """
     settings = FitSettings() if settings is None else settings
     if sensor.refraction.model != "none":
@@ -193,7 +199,34 @@ def fit_lights(
             held = best[0].near(best[1], hold)
             state = held.solve(best[1], LATER, report(f"all light, round {k + 1} of {rounds}"))
     _, state = best
-    return Fitted(with_parameters(sensor, state.p, shots.background), state, tuple(costs), tuple(errors))
+    _warn_of_bound(problem, state)
+    fitted = with_parameters(sensor, state.p, shots.background)
+    check_fitted(fitted)
+    return Fitted(fitted, state, tuple(costs), tuple(errors))
+
+
+def check_fitted(sensor: SensorSpec) -> None:
+    """Raise InputError for a fitted sensor that could not be loaded again."""
+    try:
+        validate_sensor(sensor)
+    except SpecError as error:
+        rule = f"the fit ended in a sensor that no file may hold ({error}): begin with other lights, take a stronger prior, or fix it"
+        raise InputError("sensor", value=sensor.name, rule=rule) from error
+
+
+def _warn_of_bound(problem: DirectFit, state: FitState) -> None:
+    """Log a warning where presses did not determine the camera's distance."""
+    fixed, distance = problem.settings.fixed, float(state.p.view[0])
+    if "distance" in fixed:
+        return
+    for bound in problem.views.distances("distortion" in fixed):
+        if abs(distance - bound) <= _AT_BOUND * bound:
+            _LOG.warning(
+                "the camera's distance ended at its bound, %.4g mm (start %.4g mm): these presses do not determine the view. "
+                "Take presses all over the pad, or fix 'distance' and 'distortion'",
+                distance,
+                problem.start.p.view[0],
+            )
 
 
 def solve_direct(

@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from raytac.calibrate import model_fits
+from raytac.calibrate.direct_fit import FitState
 from raytac.calibrate.image_fits import PressSamples, fit_mlp, fit_table, press_samples, with_cast_shadows
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
+from raytac.calibrate.light_parameters import LightParameters
 from raytac.calibrate.photographs import Photographs
+from raytac.calibrate.ray_fit import Fitted
+from raytac.calibrate.start import leds_at_walls
 from raytac.gel.surface import make_grid
 from raytac.optics import Mlp, Taxim
 from raytac.optics.taxim.bake.settings import BakeSettings
 from raytac.optics.taxim.bake.shadow import NOTHING
 from raytac.optics.taxim.folder import load_calibration, save_calibration
 from raytac.optics.taxim.table import PolyTable, polynomial_basis, slope_bins
-from raytac.specs import load_sensor
+from raytac.specs import SensorSpec, load_sensor, with_lights
 
 RADIUS = 3.155e-3
 SENSOR = load_sensor("gelsight_mini")
@@ -104,6 +110,26 @@ def test_a_reader_of_one_sheet_gets_what_all_samples_say(samples: PressSamples, 
     assert table.surround is not None
     assert error(table.surround, outside) < error(upstream.gradients, outside)
     assert error(table.gradients, inside) < error(upstream.gradients, inside)
+
+
+def test_a_tables_shadows_are_of_its_own_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lights are the fitted ones, the camera that of the table, which knows no other."""
+    at = presses(4, 0)
+    blank = Photographs(np.full((240, 320, 3), 90.0), np.full((4, 240, 320, 3), 90.0), at, np.full(4, RADIUS))
+    state = FitState(LightParameters.of(SENSOR, blank.background), RIGID_PAD.copy(), at)
+    camera = dataclasses.replace(SENSOR.camera, position=(0.0, 0.0, -36e-3), distortion=(0.7, 0.0, 0.0, 0.0))
+    fitted = with_lights(dataclasses.replace(SENSOR, camera=camera), leds_at_walls(SENSOR, "2,1,1"))
+    baked: list[SensorSpec] = []
+
+    def bake(table: PolyTable, lit: SensorSpec, **_: object) -> PolyTable:
+        baked.append(lit)
+        return table
+
+    monkeypatch.setattr(model_fits, "fit_lights", lambda *_, **__: Fitted(fitted, state, (0.0,), (0.0,)))
+    monkeypatch.setattr(model_fits, "with_cast_shadows", bake)
+    how: dict[str, Any] = {"settle": False, "drift": False, "prior": "tied", "shadow_table": "raytrace", "device": "cpu"}
+    model_fits.fit_models(SENSOR, blank, modes=("taxim",), **how)
+    assert [lit.lights for lit in baked] == [fitted.lights] and baked[0].camera == SENSOR.camera != fitted.camera
 
 
 def test_cast_shadows_are_levels_of_the_photographs() -> None:

@@ -104,6 +104,10 @@ def with_sizes(sensor: SensorSpec, sizes: list[tuple[float, float]]) -> SensorSp
     return dataclasses.replace(sensor, lights=dataclasses.replace(sensor.lights, leds=tuple(leds)))
 
 
+LEAST_CHANGE = {"distance": 0.05}
+"""Least change of the images [levels] by a unit of a parameter where that is not 0.1: the distance, about 28, is in mm."""
+
+
 @pytest.mark.parametrize("kind", SIZES)
 def test_derivatives_agree_with_finite_differences(sensor: SensorSpec, kind: str) -> None:
     shots, state = direct(with_sizes(sensor, SIZES[kind]), circles(6))
@@ -127,7 +131,7 @@ def test_derivatives_agree_with_finite_differences(sensor: SensorSpec, kind: str
             ends = [problem.residuals(problem.at(x + s * 1e-4 * np.eye(len(x))[k], state.circles)) for s in (1, -1)]
             image, rest = ((a - b).ravel() / 2e-4 for a, b in zip(*ends, strict=True))
             expected, found = np.concatenate([image, rest]), np.concatenate([jac[:, k], rest_jac[:, k]])
-            assert np.linalg.norm(expected) > 0.03, f"{name}: the images must change"
+            assert np.linalg.norm(expected) > LEAST_CHANGE.get(name, 0.1), f"{name}: the images must change"
             np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(expected).max(), err_msg=name)
         first += count
     assert first == len(x)
