@@ -198,7 +198,7 @@ def measure(size: int, envs: int, poisson: float, kind: str, args: Args) -> dict
         + "".join(f"  apply {value:7.4f} ms" for value in apply.values()),
         flush=True,
     )
-    return {
+    found: dict[str, Metric] = {
         f"{key}.setup_s": setup,
         f"{key}.ms_per_step": step,
         f"{key}.processor_ms_per_step": processor,
@@ -207,7 +207,8 @@ def measure(size: int, envs: int, poisson: float, kind: str, args: Args) -> dict
         f"{key}.update_ms_per_step": stages["preconditioner"],
         f"{key}.pcg_ms_per_step": stages["pcg"],
         f"{key}.env_steps_per_s": envs / float(np.mean(times[1:])),
-    } | {f"{key}.{name}": value for name, value in apply.items()}
+    }
+    return found | {f"{key}.{name}": value for name, value in apply.items()}
 
 
 def main(args: Args) -> int:
