@@ -17,9 +17,9 @@ _LOG2 = (
     -0.2072689384,
     0.1258353740,
 )
-"""Coefficients of log₂(1 + t) / t for t from √½ − 1 to √2 − 1, by least squares of the largest relative error, 3e-8."""
+"""Coefficients of log₂(1 + t) / t for t from √½ − 1 to √2 − 1; relative error 3e-8."""
 _EXP2 = 1.0, 0.6931471825, 0.2402264625, 0.0555032864, 0.0096184891, 0.0013399931, 0.0001534581
-"""The same of 2ᶠ for f from −½ to ½, 2e-9."""
+"""The same of 2ᶠ for f from −½ to ½; 2e-9."""
 _ROOT_HALF = 0x3F3504F3
 """Bits of √½ as float32."""
 
@@ -27,7 +27,8 @@ _ROOT_HALF = 0x3F3504F3
 def power(x: Any, exponent: Any) -> Any:
     """xⁿ of a Dr.Jit Float in [0, 1] for n > 0, to the rounding of float32.
 
-    What is below 2⁻¹²⁶ may be 2⁻¹²⁶. On the CPU it takes a third of the operations of ``dr.power``, which knows every number. On CUDA that is two instructions.
+    What is below 2⁻¹²⁶ may be 2⁻¹²⁶. On the CPU it takes a third of the operations of ``dr.power``, which knows every number. On CUDA that
+    is two instructions.
     """
     if dr.backend_v(x) != dr.JitBackend.LLVM:
         return dr.power(x, exponent)
