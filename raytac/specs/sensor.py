@@ -164,7 +164,8 @@ class GelpadSpec:
         if self.surface is not None:
             return -self.surface.height(x, y)
         return sum(
-            u * u / (radius + (radius * radius - u * u) ** 0.5) for u, radius in zip((x, y), self.dome_radius, strict=True)
+            u * u / (radius + (radius * radius - u * u) ** 0.5) if math.isfinite(radius) else 0.0 * u
+            for u, radius in zip((x, y), self.dome_radius, strict=True)
         )
 
     def slope(self, x: Any, y: Any) -> tuple[Any, Any]:
