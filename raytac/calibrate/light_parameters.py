@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from raytac.calibrate.camera_view import ROUNDED, view_of, with_view
+from raytac.calibrate.camera_view import ROUNDED, camera_with_view, view_of, with_view
 from raytac.calibrate.photographs import decode
 from raytac.errors import InputError
 from raytac.optics.trace.quadrature import EdgePoints, quadrature
 from raytac.specs import LedSpec, LightsSpec, SensorSpec
-from raytac.specs.sensor_check import view_edges
+from raytac.specs.sensor_check import camera_edges, view_edges
 from raytac.specs.tone import STRAIGHT, ToneCurve
 
 CHANNELS = ("red", "green", "blue")
@@ -326,7 +326,7 @@ def _beside_view(sensor: SensorSpec, p: LightParameters) -> tuple[np.ndarray, np
     low, high = (np.tile(sign * half, (len(p.leds), 1)) for sign in (-1, 1))
     sides = _sides(sensor, p)
     if sides:
-        edges = 1e3 * np.array(view_edges(with_view(sensor, p.view)))
+        edges = 1e3 * np.array(camera_edges(camera_with_view(sensor.camera, *map(float, p.view))))
         for k, (axis, end) in sides.items():
             (high, low)[end][k, axis] = edges[axis, end]
     return low, high

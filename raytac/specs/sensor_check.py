@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
 from raytac.errors import SpecError
 from raytac.specs.height_map import HeightMap
 from raytac.specs.lens import Lens
-from raytac.specs.sensor import LedSpec, SensorSpec, Vec3, shading_degree
+from raytac.specs.sensor import CameraSpec, LedSpec, SensorSpec, Vec3, shading_degree
 from raytac.specs.toml import in_mm
 from raytac.specs.tone import LEAST_SLOPE, MOST_COEFFICIENTS
 
@@ -292,7 +293,12 @@ def _check_led(sensor: SensorSpec, index: int, led: LedSpec) -> None:
 
 def view_edges(sensor: SensorSpec) -> tuple[tuple[float, float], tuple[float, float]]:
     """Lowest and highest x, then y, of the camera's view of z = 0 [m]; below it is narrower."""
-    camera = sensor.camera
+    return camera_edges(sensor.camera)
+
+
+@lru_cache(1024)  # a check asks several times, a fit for the same views again and again
+def camera_edges(camera: CameraSpec) -> tuple[tuple[float, float], tuple[float, float]]:
+    """``view_edges`` of a camera."""
     if not camera.lens.is_plain:
         slopes, depth = camera.border(), -camera.position[2]
         x, y = (
