@@ -28,10 +28,12 @@ from raytac.specs.sensor import (
     ResponseSpec,
     SensorSpec,
 )
-from tests import case_lights, marks
+from tests import case_lights, coarse_figures, marks
 
 BALL_RADIUS = 4e-3
 BALL_DEPTH = 1e-3
+GARBAGE = 20_000, 10, 20
+"""Thresholds of searches for garbage: with Python's own, 700, they take 3 % of the suite."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -54,11 +56,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """Leave what stays for the whole session, some thousand tests and all modules, out of every later search for garbage."""
     gc.freeze()
+    gc.set_threshold(*GARBAGE)
     gc.enable()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     one_thread.limit_renderer()
+    coarse_figures.limit()
     place = item.path.relative_to(Path(__file__).parent).as_posix()
     case_lights.limit(few=not place.startswith(case_lights.MEASURED))
 
