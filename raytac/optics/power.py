@@ -39,7 +39,8 @@ def power(x: Any, exponent: Any) -> Any:
     twos = bits >> 23  # x = 2^twos (1 + t)
     t: Any = dr.reinterpret_array(real, bits - (twos << 23) + _ROOT_HALF)
     t = t - 1
-    y = dr.maximum(exponent * dr.fma(t, _polynomial(_LOG2, t), real(twos)), -126)
+    y = exponent * dr.fma(t, _polynomial(_LOG2, t), real(twos))
+    y = dr.select(y > -126, y, -126)
     nearest = dr.round(y)
     return _polynomial(_EXP2, y - nearest) * dr.reinterpret_array(real, (whole(nearest) + 127) << 23)
 

@@ -124,8 +124,9 @@ class Lamp:
 
     def fan(self, p: Any) -> Fan:
         """Directions from ``p`` to the longer edge's middle line."""
-        half = dr.norm(self.half_u)
-        along, q = self.half_u / half, self.centre - p
+        length = dr.squared_norm(self.half_u)
+        per_half = dr.rsqrt(length)  # roots and divisions take as long as ten products
+        half, along, q = length * per_half, self.half_u * per_half, self.centre - p
         foot = dr.dot(q, along)
         across = q - foot * along
         square = dr.maximum(dr.squared_norm(across), 1e-12)
@@ -138,7 +139,7 @@ class Lamp:
         unit = dr.rsqrt(cosine * cosine + sine * sine)
         cosine, sine = cosine * unit, sine * unit
         span = dr.atan2(2 * half * distance, square + first * last)
-        return Fan(cosine * across + sine * along, cosine * along - sine * across, span, 0.5 * inverse / half)
+        return Fan(cosine * across + sine * along, cosine * along - sine * across, span, 0.5 * inverse * per_half)
 
     def lobe_gain(self, direction: Any) -> Any:
         """cosⁿ θ for light leaving along the unit ``direction``; 0 behind."""

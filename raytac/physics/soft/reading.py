@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -198,7 +199,7 @@ class _Batch:
         samples = make_grid(gelpad, max(_SAMPLE, *grid.pitch))
         self._clearance = BarrierClearance(self._surface, samples, mesh.d_hat, products)
         self._rows, self._columns = self._surface.matrices(grid.x, grid.y)
-        self._lattice = products.zeros(*self._surface.lattice)
+        self._lattice = self._clearance.lattice
         self._half_product = products.zeros(grid.shape[0], self._surface.lattice[1])
         self._rise = products.zeros(*grid.shape)
         self._undersides = Undersides(grid, float(grid.rest.max()), num_envs, self._device)
@@ -212,26 +213,20 @@ class _Batch:
         self._single_rest = self._on_device(grid.rest[None].astype(np.float32), wp.float32)
         self._coat, self._centre = self._zeros(num_envs, vertices, dtype=wp.vec3d), self._zeros(num_envs, dtype=wp.vec2d)
         self.unread = self._zeros(num_envs, dtype=wp.bool)
-        self._state: CoatState | None = None
-        self._recorded: Recorded | None = None
-        self._shown: Any = None
+        self._measured, self._shown = (_Repeated(f, self._device) for f in (self._launch_clearance, self._launch_all))
         self._residual, self._failed = self._zeros(num_envs, dtype=wp.float64), self._zeros(num_envs, dtype=wp.bool)
 
     def measure(self, state: CoatState) -> wp.array:
         """Launch the clearance of all environments [m], (B,)."""
-        self._find_sound(state, self._none_failed)
-        return self._measure(state)
+        return self._measured(state)
 
     def read(self, state: CoatState) -> PadArrays:
         """Show a state, but for the environments ``unread``."""
-        if self._state is not state:
-            self._state, self._recorded = state, None
-            self._shown = self._launch_all(state)
-            return self._shown
-        if self._recorded is None:
-            self._recorded = Recorded(partial(self._launch_all, state), device=self._device)
-        self._recorded()
-        return self._shown
+        return self._shown(state)
+
+    def _launch_clearance(self, state: CoatState) -> wp.array:
+        self._find_sound(state, self._none_failed)
+        return self._measure(state)
 
     def _launch_all(self, state: CoatState) -> PadArrays:
         """Launch all that is shown."""
@@ -239,7 +234,6 @@ class _Batch:
         lines, under = self._height.shape[:2], self._undersides
         self._find_sound(state, self.unread)
         clearance = self._measure(state)
-        self._surface.rise(self._lattice)
         plain: Any = self._plain if correction is not None and correction.normal else None
         self._launch(kernels.choose_plain, len(sound), [clearance, state.objects.touching, self._plain])
         self._products.sandwich(self._rows, self._lattice, self._columns, self._half_product, self._rise, active=plain)
@@ -330,3 +324,23 @@ class _Batch:
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, device=self._device)
+
+
+class _Repeated:
+    """Launches for a state: one by one, and from the second time on for the same state as one recording."""
+
+    def __init__(self, launch: Callable[[CoatState], Any], device: Any) -> None:
+        """``launch``: returns the same arrays every time."""
+        self._launch, self._device = launch, device
+        self._state: CoatState | None = None
+        self._recorded: Recorded | None = None
+        self._result: Any = None
+
+    def __call__(self, state: CoatState) -> Any:
+        if self._state is not state:
+            self._state, self._recorded, self._result = state, None, self._launch(state)
+        else:
+            if self._recorded is None:
+                self._recorded = Recorded(partial(self._launch, state), device=self._device)
+            self._recorded()
+        return self._result
