@@ -6,16 +6,21 @@ import sys
 from functools import wraps
 from typing import Any
 
+from tests.on_import import change_module
+
 MOST = 100.0
 """Most dots per inch of a figure that a test saves."""
 
 
 def limit() -> None:
-    """Save figures with at most ``MOST`` dots per inch, once Matplotlib is imported."""
-    module: Any = sys.modules.get("matplotlib.figure")
-    if module is None or hasattr(module.Figure.savefig, "__wrapped__"):
-        return
+    """Save figures with at most ``MOST`` dots per inch from now on."""
+    change_module("matplotlib.figure", _limit)
+
+
+def _limit(module: Any) -> None:
     save = module.Figure.savefig
+    if hasattr(save, "__wrapped__"):
+        return
 
     @wraps(save)
     def coarse(figure: Any, *args: Any, dpi: Any = None, **options: Any) -> None:

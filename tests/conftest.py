@@ -39,6 +39,7 @@ GARBAGE = 20_000, 10, 20
 def pytest_configure(config: pytest.Config) -> None:
     gc.disable()  # a quarter of what collection takes, and it finds nothing: `pytest_collection_finish`
     marks.block(str(config.getoption("markexpr")))
+    coarse_figures.limit()
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -62,7 +63,6 @@ def pytest_collection_finish() -> None:
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     one_thread.limit_renderer()
-    coarse_figures.limit()
     place = item.path.relative_to(Path(__file__).parent).as_posix()
     case_lights.limit(few=not place.startswith(case_lights.MEASURED))
 

@@ -58,7 +58,9 @@ def shrunk(images: np.ndarray, factor: int) -> np.ndarray:
     *batch, height, width, _ = images.shape
     rows = images.reshape(*batch, height // factor, factor, width, 3).sum(-3)
     # Ten times faster than a mean over both axes, which goes through memory pixel by pixel.
-    total = sum((rows[..., k::factor, :] for k in range(1, factor)), start=rows[..., ::factor, :])
+    total = rows[..., ::factor, :]
+    for k in range(1, factor):
+        total = total + rows[..., k::factor, :]
     return total / factor**2
 
 
