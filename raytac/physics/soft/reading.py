@@ -327,7 +327,7 @@ class _Batch:
 
 
 class _Repeated:
-    """Launches for a state: one by one, and from the second time on for the same state as one recording."""
+    """Launches for a state, which are one recording from the second time on."""
 
     def __init__(self, launch: Callable[[CoatState], Any], device: Any) -> None:
         """``launch``: returns the same arrays every time."""
