@@ -52,16 +52,16 @@ def layer_motion(before: np.ndarray, after: np.ndarray, circle: np.ndarray, radi
     used = is_coat & (x**2 + y**2 < min(circle[2], 0.95 * radius) ** 2)
     x, y, u, v, rings = x[used], y[used], u[used], v[used], first[used]
     s = np.sqrt(radius**2 - x**2 - y**2) - radius
-    later = is_later.astype(float)
+    later, splines = is_later.astype(float), ndimage.spline_filter(second, order=3, mode="constant")
 
     def cost(motion: np.ndarray) -> float:
         dx, dy, *roll = motion
         across, along = roll or (0.0, 0.0)
-        place = [v + dy + along * s, u + dx + across * s]
+        place = np.stack([v + dy + along * s, u + dx + across * s])
         seen = ndimage.map_coordinates(later, place, order=1) > 0.99
         if seen.sum() < 50:
             return 0.0
-        one, two = rings[seen], ndimage.map_coordinates(second, place, order=3)[seen]
+        one, two = rings[seen], ndimage.map_coordinates(splines, place[:, seen], order=3, prefilter=False)
         if one.std() == 0.0 or two.std() == 0.0:  # a ball without layers
             return 0.0
         return -float(np.corrcoef(one, two)[0, 1])
