@@ -39,7 +39,8 @@ class Surface:
 class Candidates:
     """Pairs (first, second, body pair) that may come within d̂; counts may exceed what fits.
 
-    ``pt_gap``, ``ee_gap``: their distances [m] at positions from which no vertex is farther than ``moved`` [m] (:mod:`ipc.contact.reach`).
+    ``pt_gap``, ``ee_gap``: their distances [m], or lower bounds of them, at positions from which no vertex is farther than ``moved`` [m]
+    (:mod:`ipc.contact.reach`).
     On a CPU ``pt_near`` and ``ee_near`` list those nearer than ``near`` [m] at these positions, ``near_count`` (2, B) of them.
     """
 
@@ -109,7 +110,10 @@ def listed_at(candidates: Candidates, ee: wp.bool, env: wp.int32, near: wp.bool,
 
 @wp.func
 def gap_bounds(candidates: Candidates, ee: wp.bool, env: wp.int32, i: wp.int32):
-    """Least and largest distance [m] of candidate i in the motion that was checked last."""
+    """Least and largest distance [m] of candidate i in the motion that was checked last.
+
+    Both of a lower bound where the candidate is away (:mod:`ipc.contact.reach`), and not of its distance.
+    """
     gap = wp.float64(0.0)
     if ee:  # a conditional expression would read both lists, of which one may be shorter
         gap = candidates.ee_gap[env, i] + wp.float64(0.0)

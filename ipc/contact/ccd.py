@@ -243,6 +243,7 @@ def ccd_pairs(
     only = only_near(candidates, env, wp.float64(2.0) * allowed_end(most, slack[env], floor[env], least))
     for k in range(first, listed(candidates, ee, env, only), threads):
         i = listed_at(candidates, ee, env, only, k)
+        # What remains of a distance grows with it, so that a lower bound of it may say that there is enough.
         near, most = gap_bounds(candidates, ee, env, i)
         if near > wp.float64(2.0) * allowed_end(most, slack[env], floor[env], least):
             continue

@@ -4,7 +4,8 @@ A list of candidates is valid for a while, so most of its pairs are several d̂ 
 energies or limits of a step are wanted is most of their time. The distance g of every candidate is therefore measured at reference
 positions. While no vertex is farther than m from its place there, the distance of the pair is at least g − 2m, which is a number to
 compare with. That is the skin of Verlet's neighbour lists (Verlet 1967, Phys. Rev. 159) around pairs instead of vertices. Positions are
-measured anew once m exceeds ``DRIFT`` of d̂. Results are the same: only pairs are left out that would add nothing.
+measured anew once m exceeds ``DRIFT`` of d̂. Pairs that are more than ``AWAY`` d̂ apart even then are not: their number becomes
+g − 2m, which is no longer their distance but not above it. Results are the same: only pairs are left out that would add nothing.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportGeneralTypeIssues=false, reportIndexIssue=false
@@ -15,7 +16,7 @@ from __future__ import annotations
 import warp as wp
 
 from ipc.arrays import FloatArray, FloatArray2d, IntArray, VecArray2d
-from ipc.broad_phase.lists import Candidates, Surface, pair_at, pair_vertices, pairs_of
+from ipc.broad_phase.lists import Candidates, Surface, gap_bounds, pair_at, pair_vertices, pairs_of
 from ipc.contact.distance import pair_coefficients, separation
 from ipc.reduce import MAX, Reducer
 
@@ -23,6 +24,11 @@ wp.set_module_options({"enable_backward": False})
 
 DRIFT = 0.5
 """Displacement of a vertex over d̂ from which distances are measured anew."""
+AWAY = wp.constant(wp.float64(5.0))
+"""Distance over d̂ down to which a lower bound stands for a candidate's distance.
+
+Until there is a new list.
+"""
 NEAR = 2.5
 """Distance over d̂ of the candidates that are listed on a CPU.
 
@@ -68,15 +74,24 @@ def set_reference(x: VecArray2d, dx: VecArray2d, far: IntArray, reference: VecAr
 
 
 @wp.kernel
-def measure_pairs(x: VecArray2d, surface: Surface, ee: wp.bool, far: IntArray, threads: wp.int32, candidates: Candidates):
-    """Distances of the candidates at x, by (environment, thread)."""
+def measure_pairs(
+    x: VecArray2d, surface: Surface, ee: wp.bool, far: IntArray, stale: IntArray, threads: wp.int32, candidates: Candidates
+):
+    """Distances of the candidates at x, or what ``moved`` leaves of the last ones.
+
+    By (environment, thread).
+    """
     env, first = wp.tid()
     if far[env] == 0:
         return
+    known = stale[env] == 0
     for i in range(first, pairs_of(candidates, ee, env), threads):
-        v = pair_vertices(surface, ee, pair_at(candidates, ee, env, i))
-        x0, x1, x2, x3 = x[env, v[0]], x[env, v[1]], x[env, v[2]], x[env, v[3]]
-        gap = wp.length(separation(pair_coefficients(ee, x0, x1, x2, x3), x0, x1, x2, x3))
+        least, _most = gap_bounds(candidates, ee, env, i)
+        gap = least + wp.float64(0.0)
+        if not (known and least > AWAY * surface.d_hat):
+            v = pair_vertices(surface, ee, pair_at(candidates, ee, env, i))
+            x0, x1, x2, x3 = x[env, v[0]], x[env, v[1]], x[env, v[2]], x[env, v[3]]
+            gap = wp.length(separation(pair_coefficients(ee, x0, x1, x2, x3), x0, x1, x2, x3))
         if ee:
             candidates.ee_gap[env, i] = gap
         else:
@@ -133,16 +148,16 @@ class Reach:
         self._reduce(self._size, active, MAX, candidates.moved)
         inputs = [candidates.moved, self._limit, stale, active]
         self._launch(choose_far, (self.batch,), inputs, [self._far, self._any_far])
-        wp.capture_if(self._any_far, on_true=self._measure, x=x, dx=dx, surface=surface, candidates=candidates)
+        wp.capture_if(self._any_far, on_true=self._measure, x=x, dx=dx, surface=surface, candidates=candidates, stale=stale)
 
-    def _measure(self, x: wp.array, dx: wp.array, surface: Surface, candidates: Candidates) -> None:
-        self._launch(set_reference, x.shape, [x, dx, self._far], [self._reference, self._size, candidates.moved])
-        self._reduce(self._size, self._far, MAX, candidates.moved)
+    def _measure(self, x: wp.array, dx: wp.array, surface: Surface, candidates: Candidates, stale: wp.array) -> None:
         for ee, pairs in ((False, candidates.pt), (True, candidates.ee)):
             threads = min(pairs.shape[1], self._threads)
-            self._launch(measure_pairs, (self.batch, threads), [x, surface, ee, self._far, threads], [candidates])
+            self._launch(measure_pairs, (self.batch, threads), [x, surface, ee, self._far, stale, threads], [candidates])
             if not self.device.is_cuda:
                 self._launch(list_near, (self.batch,), [ee, self._far], [candidates])
+        self._launch(set_reference, x.shape, [x, dx, self._far], [self._reference, self._size, candidates.moved])
+        self._reduce(self._size, self._far, MAX, candidates.moved)
 
     def _launch(self, kernel: object, dim: tuple[int, ...], inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

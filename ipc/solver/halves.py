@@ -3,6 +3,9 @@
 They are for a CPU, and worlds without free bodies. A block above the diagonal is read once and multiplies twice. Conjugate gradients
 would multiply by each contact row many times; a row at nodes of one face or edge of a pad fits the matrix, and is added to its blocks
 instead. Rows of blocks are copied out as vectors of four numbers, which a processor multiplies at once; so are vectors of unknowns.
+
+What an iteration of conjugate gradients repeats is written in C++, here, in :mod:`ipc.solver.lines` and in :mod:`ipc.solver.pcg_serial`: in
+Warp every index is compared with 0 and multiplied by a stride, which takes as long as the arithmetic.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportCallIssue=false, reportGeneralTypeIssues=false
@@ -158,46 +161,73 @@ def add_open_row(
     return w * s * s
 
 
+@wp.func_native("""
+    using vec4 = wp::vec_t<4, wp::float64>;
+    const int nodes = p.shape[1];
+    const vec4* x = p.data + (long long)env * nodes;
+    vec4* y = out.data + (long long)env * nodes;
+    const vec4* rows = system.half_rows.data + (long long)env * system.half_rows.shape[1];
+    const vec4* diagonal = system.half_diagonal.data + (long long)env * system.half_diagonal.shape[1];
+    const int* start = system.above_start.data;
+    const int* above = system.above.data;
+    const int* col = system.col.data;
+    for (int i = 0; i < nodes; ++i) {
+        const vec4 h = x[i];
+        y[i] = h[0] * diagonal[3 * i] + h[1] * diagonal[3 * i + 1] + h[2] * diagonal[3 * i + 2];
+    }
+    vec4 total;
+    for (int i = 0; i < nodes; ++i) {
+        const vec4 here = x[i];
+        vec4 a, b, c;
+        for (int m = start[i]; m < start[i + 1]; ++m) {
+            const int j = col[above[m]];
+            const vec4 there = x[j], r0 = rows[3 * m], r1 = rows[3 * m + 1], r2 = rows[3 * m + 2];
+            a += wp::cw_mul(r0, there);
+            b += wp::cw_mul(r1, there);
+            c += wp::cw_mul(r2, there);
+            y[j] += here[0] * r0 + here[1] * r1 + here[2] * r2;
+        }
+        const vec4 f = y[i] + vec4(a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2], 0.0);
+        y[i] = f;
+        total += wp::cw_mul(here, f);
+    }
+    double sum = total[0] + total[1] + total[2];
+    const vec4* volume = system.half_volume.data + (long long)env * system.half_volume.shape[1];
+    const int* first = system.block_pair_start.data;
+    const int* node = system.pair_node.data;
+    for (int b = 0; b < system.volume_motion.shape[1]; ++b) {
+        vec4 even, odd;
+        const int end = first[b + 1];
+        int k = first[b];
+        for (; k + 1 < end; k += 2) {
+            even += wp::cw_mul(volume[k], x[node[k]]);
+            odd += wp::cw_mul(volume[k + 1], x[node[k + 1]]);
+        }
+        if (k < end)
+            even += wp::cw_mul(volume[k], x[node[k]]);
+        const vec4 both = even + odd;
+        const double s = both[0] + both[1] + both[2];
+        for (k = first[b]; k < end; ++k)
+            y[node[k]] += s * volume[k];
+        sum += s * s;
+    }
+    return sum;
+""")
+def multiply_upper(system: SystemView, env: wp.int32, p: Vec4Array2d, out: Vec4Array2d) -> wp.float64:
+    """out = (blocks + volume rows) p on the unknowns, else 0; returns p·out.
+
+    After :func:`fold_rows`.
+    """
+    ...
+
+
 @wp.func
 def multiply_half(system: SystemView, contacts: Contacts, env: wp.int32, p: Vec4Array2d, out: Vec4Array2d) -> wp.float64:
     """out = H p on the unknowns, else 0, after :func:`fold_rows`; returns p·out.
 
     p is 0 elsewhere.
     """
-    total, zero = wp.vec4d(), wp.float64(0.0)
-    rows, diagonal, volume = system.half_rows[env], system.half_diagonal[env], system.half_volume[env]
-    x, y = p[env], out[env]
-    for i in range(x.shape[0]):
-        h = x[i]
-        y[i] = h[0] * diagonal[3 * i] + h[1] * diagonal[3 * i + 1] + h[2] * diagonal[3 * i + 2]
-    for i in range(x.shape[0]):
-        here, a, b, c = x[i] + wp.vec4d(), wp.vec4d(), wp.vec4d(), wp.vec4d()
-        for m in range(system.above_start[i], system.above_start[i + 1]):
-            j = system.col[system.above[m]]
-            there, r0, r1, r2 = x[j], rows[3 * m], rows[3 * m + 1], rows[3 * m + 2]
-            a += wp.cw_mul(r0, there)
-            b += wp.cw_mul(r1, there)
-            c += wp.cw_mul(r2, there)
-            y[j] = y[j] + (here[0] * r0 + here[1] * r1 + here[2] * r2)
-        f = y[i] + wp.vec4d(a[0] + a[1] + a[2], b[0] + b[1] + b[2], c[0] + c[1] + c[2], zero)
-        y[i] = f
-        total += wp.cw_mul(here, f)
-    result = total[0] + total[1] + total[2]
-    for b in range(system.volume_motion.shape[1]):
-        even, odd, end = wp.vec4d(), wp.vec4d(), system.block_pair_start[b + 1]
-        k = system.block_pair_start[b] + 0
-        while k + 1 < end:
-            even += wp.cw_mul(volume[k], x[system.pair_node[k]])
-            odd += wp.cw_mul(volume[k + 1], x[system.pair_node[k + 1]])
-            k += 2
-        if k < end:
-            even += wp.cw_mul(volume[k], x[system.pair_node[k]])
-        both = even + odd
-        s = both[0] + both[1] + both[2]
-        for k in range(system.block_pair_start[b], end):
-            i = system.pair_node[k]
-            y[i] = y[i] + s * volume[k]
-        result += s * s
+    result = multiply_upper(system, env, p, out)
     for k in range(contacts.open_count[env]):
         result += add_open_row(system, contacts, env, contacts.open_row[env, k], p, out)
     return result

@@ -74,25 +74,43 @@ def factor_lines(lines: Lines, system: SystemView, active: IntArray, inverse: Ma
             lines.inverse[env, 3 * k + a] = wp.vec4d(D[a, 0], D[a, 1], D[a, 2], wp.float64(0.0))
 
 
-@wp.func
+@wp.func_native("""
+    using vec4 = wp::vec_t<4, wp::float64>;
+    const int FIRST = -2147483647 - 1;
+    const int n = lines.node.shape[0];
+    const int* node = lines.node.data;
+    const vec4* lower = lines.lower.data + (long long)env * lines.lower.shape[1];
+    const vec4* upper = lines.upper.data + (long long)env * lines.upper.shape[1];
+    const vec4* inverse = lines.inverse.data + (long long)env * lines.inverse.shape[1];
+    const vec4* source = r.data + (long long)env * r.shape[1];
+    vec4* result = z.data + (long long)env * z.shape[1];
+    const int* link = lines.link.data;
+    vec4 y, total;
+    for (int k = 0; k < n; ++k) {
+        const int i = node[k];
+        if (link[k] == FIRST)
+            y = source[i];
+        else
+            y = source[i] - (y[0] * lower[3 * k] + y[1] * lower[3 * k + 1] + y[2] * lower[3 * k + 2]);
+        result[i] = y;
+    }
+    y = vec4();
+    for (int k = n - 1; k >= 0; --k) {
+        const int i = node[k];
+        vec4 v = result[i];
+        v = v[0] * inverse[3 * k] + v[1] * inverse[3 * k + 1] + v[2] * inverse[3 * k + 2] - y;
+        result[i] = v;
+        total += wp::cw_mul(source[i], v);
+        if (link[k] == FIRST)
+            y = vec4();
+        else
+            y = v[0] * upper[3 * k] + v[1] * upper[3 * k + 1] + v[2] * upper[3 * k + 2];
+    }
+    return total[0] + total[1] + total[2];
+""")
 def apply_lines(lines: Lines, env: wp.int32, r: Vec4Array2d, z: Vec4Array2d) -> wp.float64:
     """z = M⁻¹ r on the unknowns; returns r·z."""
-    lower, upper, inverse, source, result = lines.lower[env], lines.upper[env], lines.inverse[env], r[env], z[env]
-    n = lines.node.shape[0]
-    y, total = wp.vec4d(), wp.vec4d()
-    for k in range(n):
-        y = source[lines.node[k]] - (y[0] * lower[3 * k] + y[1] * lower[3 * k + 1] + y[2] * lower[3 * k + 2])
-        result[lines.node[k]] = y
-    y = wp.vec4d()
-    for step in range(n):
-        k = n - 1 - step
-        i = lines.node[k]
-        v = result[i]
-        v = v[0] * inverse[3 * k] + v[1] * inverse[3 * k + 1] + v[2] * inverse[3 * k + 2] - y
-        result[i] = v
-        total += wp.cw_mul(source[i], v)
-        y = v[0] * upper[3 * k] + v[1] * upper[3 * k + 1] + v[2] * upper[3 * k + 2]
-    return total[0] + total[1] + total[2]
+    ...
 
 
 def make_lines(layout: Layout, where: NDArray[np.integer], batch: int, device: wp.Device) -> Lines:

@@ -56,6 +56,48 @@ def precondition(lines: Lines, inverse: MatArray2d, affine: Elimination, env: wp
     return rz
 
 
+@wp.func_native("""
+    using vec4 = wp::vec_t<4, wp::float64>;
+    const int n = lines.node.shape[0];
+    const int* node = lines.node.data;
+    const long long first = (long long)env * w.r.shape[1];
+    vec4* residual = w.r.data + first;
+    const vec4* direction = w.p.data + first;
+    const vec4* product = w.Ap.data + first;
+    wp::vec_t<3, wp::float64>* solution = x.data + (long long)env * x.shape[1];
+    vec4 squares;
+    for (int k = 0; k < n; ++k) {
+        const int i = node[k];
+        const vec4 step = alpha * direction[i];
+        solution[i] += wp::vec_t<3, wp::float64>(step[0], step[1], step[2]);
+        const vec4 rest = residual[i] - alpha * product[i];
+        residual[i] = rest;
+        squares += wp::cw_mul(rest, rest);
+    }
+    return squares[0] + squares[1] + squares[2];
+""")
+def advance(lines: Lines, env: wp.int32, alpha: wp.float64, w: Vectors, x: VecArray2d) -> wp.float64:
+    """x += α p, r −= α H p; returns r·r."""
+    ...
+
+
+@wp.func_native("""
+    using vec4 = wp::vec_t<4, wp::float64>;
+    const int n = lines.node.shape[0];
+    const int* node = lines.node.data;
+    const long long first = (long long)env * w.r.shape[1];
+    vec4* direction = w.p.data + first;
+    const vec4* z = w.Ap.data + first;
+    for (int k = 0; k < n; ++k) {
+        const int i = node[k];
+        direction[i] = z[i] + beta * direction[i];
+    }
+""")
+def turn(lines: Lines, env: wp.int32, beta: wp.float64, w: Vectors):
+    """p = z + β p."""
+    ...
+
+
 @wp.kernel
 def solve_serially(
     system: SystemView,
@@ -89,7 +131,6 @@ def solve_serially(
         rr0 += wp.length_sq(v)
     if rr0 == wp.float64(0.0):
         return
-    residual, direction, product, solution = w.r[env], w.p[env], w.Ap[env], x[env]
     rz = precondition(lines, inverse, affine, env, w, w.p)
     rz0 = rz + wp.float64(0.0)
     for it in range(max_iterations):
@@ -98,21 +139,11 @@ def solve_serially(
             s.negative[env] = 1
             break
         s.iterations[env] = it + 1
-        alpha, squares = rz / curvature, wp.vec4d()
-        for k in range(n):
-            i = lines.node[k]
-            solution[i] = solution[i] + alpha * head(direction[i])
-            rest = residual[i] - alpha * product[i]
-            residual[i] = rest
-            squares += wp.cw_mul(rest, rest)
+        rr, small = advance(lines, env, rz / curvature, w, x), tolerance * tolerance
         new = precondition(lines, inverse, affine, env, w, w.Ap)
-        rr, small = squares[0] + squares[1] + squares[2], tolerance * tolerance
         if not (rr > small * rr0) and not (new > small * rz0):
             break
-        beta = new / rz
+        turn(lines, env, new / rz, w)
         rz = new
-        for k in range(n):
-            i = lines.node[k]
-            direction[i] = product[i] + beta * direction[i]
     for k in range(n):
-        r[env, lines.node[k]] = head(residual[lines.node[k]])
+        r[env, lines.node[k]] = head(w.r[env, lines.node[k]])

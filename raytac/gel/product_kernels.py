@@ -2,6 +2,10 @@
 
 A row is a row of packets, vectors of neighbouring numbers. A thread computes a packet in each of ``ROWS`` rows, so that what it reads is
 used as often.
+
+Here and in the kernels of soft pads, loops that take time count with ``while``, from a number that the compiler sees is not negative. On
+the CPU Warp's ``for`` over a range that is known only when it runs takes longer than the arithmetic in it, and so does the test of every
+index for a negative one.
 """
 
 # pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
@@ -55,7 +59,7 @@ def multiply(
     lanes = wp.int32(len(none))
     a_env, b_env = wp.min(env, left.shape[0] - 1), wp.min(env, right.shape[0] - 1)
     first, last = columns[env][0] // lanes, (columns[env][1] + lanes - 1) // lanes
-    low, high = inner[env][0], inner[env][1]
+    low, high = wp.max(inner[env][0], 0), inner[env][1]
     for p in range(first + thread, last, threads):
         a, b, c, d = out.dtype(), out.dtype(), out.dtype(), out.dtype()
         if adds != 0:
@@ -63,12 +67,14 @@ def multiply(
             b += out[env, j + 1, p]
             c += out[env, j + 2, p]
             d += out[env, j + 3, p]
-        for k in range(low, high):
+        k = low + 0
+        while k < high:
             w = right[b_env, k, p]
             a += left[a_env, j, k] * w
             b += left[a_env, j + 1, k] * w
             c += left[a_env, j + 2, k] * w
             d += left[a_env, j + 3, k] * w
+            k += 1
         out[env, j, p] = a
         out[env, j + 1, p] = b
         out[env, j + 2, p] = c

@@ -108,10 +108,12 @@ class Products:
             device=self.device,
         )
 
-    def sandwich(self, left: Matrices, core: Matrices, right: Matrices, spare: Matrices, out: Matrices) -> None:
-        """Launch out = left @ core @ right.
+    def sandwich(
+        self, left: Matrices, core: Matrices, right: Matrices, spare: Matrices, out: Matrices, active: wp.array | None = None
+    ) -> None:
+        """Launch out = left @ core @ right, of all environments or of those ``active`` (B,).
 
         ``spare`` (rows of left, columns of core) is overwritten.
         """
-        self.multiply(left, core, spare)
-        self.multiply(spare, right, out)
+        self.multiply(left, core, spare, active=active)
+        self.multiply(spare, right, out, active=active)

@@ -134,8 +134,8 @@ class CoatLayout(NodeGrid):
 class CoatField:
     """B coat surfaces as device arrays, computed each frame from heights.
 
-    ``nodes`` holds (z, n_x, n_y, n_z) a node, so that one packet gather brings the normal, and ``cells`` the heights at the four corners
-    of a cell, for the walks. Normals point to the camera side (n_z < 0), as the vertex normals of the reference's mesh do.
+    ``slopes`` holds (∂z/∂x, ∂z/∂y) a node, so that one packet gather brings its normal, and ``cells`` the heights at the four corners of a
+    cell, for the walks. Normals point to the camera side (n_z < 0), as the vertex normals of the reference's mesh do.
     """
 
     def __init__(self, mi: Any, layout: CoatLayout, rest: Any, height: Any) -> None:
@@ -144,8 +144,8 @@ class CoatField:
         ``rest``: the gel at rest, or a concave surface above it, as of ``concave_cover``.
         """
         self.mi, self.layout, self.rest, self.height = mi, layout, rest, height
-        self.nodes, self.cells = dr.ravel(pack_nodes(mi, layout, height)), dr.ravel(pack_cells(mi, layout, height))
-        dr.eval(self.nodes, self.cells)
+        self.slopes, self.cells = dr.ravel(pack_slopes(mi, layout, height)), dr.ravel(pack_cells(mi, layout, height))
+        dr.eval(self.slopes, self.cells)
         self.lowest, self.highest = bounds_map(mi, layout, height)
         dr.eval(self.lowest, self.highest)
 
@@ -158,9 +158,9 @@ class CoatField:
 
     @staticmethod
     def memory_per_env(layout: CoatLayout) -> int:
-        """Bytes of one surface: normals and corners of every node, and the tiles' bounds."""
+        """Bytes of one surface: slopes and corners of every node, and the tiles' bounds."""
         g = layout
-        return 32 * g.nx * g.ny + 8 * g.ny * g.tiles_x + 16 * g.tiles_x * g.tiles_y
+        return 24 * g.nx * g.ny + 8 * g.ny * g.tiles_x + 16 * g.tiles_x * g.tiles_y
 
     def z(self, env: Any, x: Any, y: Any, active: Any = True) -> Any:
         """Bilinear height [m] at (x, y) [m]."""
@@ -176,8 +176,8 @@ class CoatField:
         """The unit normal at (x, y) [m], interpolated between nodes."""
         mi, g = self.mi, self.layout
         i, wx, wy = g.cell(mi, env, x, y)
-        node = bilinear(g.corners(mi.Vector4f, self.nodes, i), wx, wy)
-        return dr.normalize(mi.Normal3f(node.y, node.z, node.w))
+        n = bilinear([_normal(mi, corner) for corner in g.corners(mi.Vector2f, self.slopes, i)], wx, wy)
+        return dr.normalize(mi.Normal3f(n))
 
     def tile(self, env: Any, x: Any, y: Any) -> Any:
         """Index into the bounds map of the tile under (x, y)."""
@@ -226,20 +226,25 @@ class CoatField:
         return mi.Point3f(ox + (z - oz) * tx, oy + (z - oz) * ty, z)
 
 
-def pack_nodes(mi: Any, g: CoatLayout, height: Any) -> Any:
-    """(z, n_x, n_y, n_z) at nodes of ``height`` (B·Ny·Nx); one-sided differences on the rim."""
+def pack_slopes(mi: Any, g: CoatLayout, height: Any) -> Any:
+    """(∂z/∂x, ∂z/∂y) at nodes of ``height`` (B·Ny·Nx); one-sided differences on the rim."""
     i = dr.arange(mi.UInt32, dr.width(height))
-    zx, zy = g.slopes(mi, height, i, i % g.nx, (i // g.nx) % g.ny)
-    inv = dr.rsqrt(zx * zx + zy * zy + 1)
-    return mi.Vector4f(height, zx * inv, zy * inv, -inv)
+    return mi.Vector2f(*g.slopes(mi, height, i, i % g.nx, (i // g.nx) % g.ny))
+
+
+def _normal(mi: Any, slopes: Any) -> Any:
+    inv = dr.rsqrt(slopes.x * slopes.x + slopes.y * slopes.y + 1)
+    return mi.Vector3f(slopes.x * inv, slopes.y * inv, -inv)
 
 
 def pack_cells(mi: Any, g: CoatLayout, height: Any) -> Any:
     """Four corners of the cell right of and below every node, for one gather instead of four."""
     i = dr.arange(mi.UInt32, dr.width(height))
-    right, down = dr.select(i % g.nx < g.nx - 1, 1, 0), dr.select((i // g.nx) % g.ny < g.ny - 1, g.nx, 0)
-    corners = (0, right, down, right + down)
-    return mi.Vector4f([dr.gather(mi.Float, height, i + offset) for offset in corners])
+    ix, iy = i % g.nx, (i // g.nx) % g.ny
+    # Named as in ``slopes``, so that Dr.Jit gathers them once.
+    right, down = dr.select(ix < g.nx - 1, i + 1, i), dr.select(iy < g.ny - 1, i + g.nx, i)
+    across = dr.select(iy < g.ny - 1, right + g.nx, right)
+    return mi.Vector4f(height, *(dr.gather(mi.Float, height, corner) for corner in (right, down, across)))
 
 
 def bounds_map(mi: Any, g: CoatLayout, height: Any) -> tuple[Any, Any]:

@@ -11,6 +11,7 @@ from numpy.polynomial import chebyshev
 
 from raytac.errors import InputError, SpecError
 from raytac.optics.camera import Pinhole
+from raytac.optics.power import power
 from raytac.specs.sensor import ResponseSpec, SensorSpec, shading_degree
 
 SATURATED = 0.05
@@ -70,7 +71,7 @@ class Response:
         values = [linear[c] * dr.gather(mi.Float, scale[c], pixel) + float(self.black[c]) for c in range(3)]
         if self.monochrome:
             values = [(values[0] + values[1] + values[2]) / 3] * 3
-        levels: list[Any] = [dr.power(dr.clip(value, 0, 1), 1 / self.spec.gamma) for value in values]
+        levels: list[Any] = [power(dr.clip(value, 0, 1), 1 / self.spec.gamma) for value in values]
         if not self.curve.is_plain:  # rounding may pass black or white
             levels = [dr.clip(self.curve.bent(u), 0, 1) for u in levels]
         out = [level * 255 + 0.5 for level in levels]

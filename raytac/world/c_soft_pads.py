@@ -53,7 +53,7 @@ class CSoftPads(SoftPads):
             (body.name, *(NumberWriter(self._datas, member, size * body.mocap + np.arange(size)) for member, size in _MOCAP))
             for body in self._own
         ]
-        self._robot = RobotOverlap(composed)
+        self._robot = RobotOverlap(composed, self._datas)
         self._warned: set[tuple[str, str]] = set()
         self._refuse_inside(range(len(datas)))
         self._coupling = None
@@ -158,11 +158,10 @@ class CSoftPads(SoftPads):
     def _inside(self, envs: Sequence[int] | range | np.ndarray, *, only_rigid: bool = False) -> Iterator[tuple[int, Inside]]:
         """Overlaps with cases and links by environment: rigid bodies in MuJoCo, soft by vertices."""
         soft = {name: self.soft.mesh(name)[0] for name, body in self.soft.bodies.items() if body.is_soft and not only_rigid}
-        for b in envs:
-            overlaps = self._robot.rigid(self._datas[b])
-            for name, vertices in soft.items():
-                overlaps += self._robot.soft(self._datas[b], name, vertices[b])
-            yield from ((int(b), one) for one in overlaps if one.depth > _INSIDE)
+        by_vertices = ((int(b), one) for b in envs for name, x in soft.items() for one in self._robot.soft(b, name, x[b]))
+        for b, one in (*self._robot.rigid(envs), *by_vertices):
+            if one.depth > _INSIDE:
+                yield b, one
 
     def _refuse_inside(self, envs: Sequence[int] | range, *, only_rigid: bool = False) -> None:
         for b, one in self._inside(envs, only_rigid=only_rigid):

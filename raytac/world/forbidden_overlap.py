@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -10,6 +10,7 @@ import numpy as np
 
 from raytac.errors import InputError
 from raytac.physics.geoms import geom_part
+from raytac.robots.states import StateReader, numbers
 from raytac.shapes.point_depth import SOLIDS, point_depth
 from raytac.world.world_model import WorldModel
 
@@ -65,31 +66,42 @@ class RobotOverlap:
     half-spaces of the robot.
     """
 
-    def __init__(self, composed: WorldModel) -> None:
+    def __init__(self, composed: WorldModel, datas: Sequence[mujoco.MjData]) -> None:
+        """``datas``: states of all environments."""
         self.model = model = composed.model
+        self._datas = tuple(datas)
         scene = {body.index for body in composed.touched}
         solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-        self.robot = np.array([g for g in np.flatnonzero(solid) if int(model.geom_bodyid[g]) not in scene], int)
-        self.mirrors = {body.name: np.array(body.geoms) for body in composed.touched if body.mocap >= 0}
+        self._robot = np.array([g for g in np.flatnonzero(solid) if int(model.geom_bodyid[g]) not in scene], int)
+        mirrored = [(body.name, int(g)) for body in composed.touched if body.mocap >= 0 for g in body.geoms]
+        self._names, self._own = [name for name, _ in mirrored], np.array([g for _, g in mirrored], int)
+        radius = model.geom_rbound
+        self._reach = radius[self._own, None] + radius[self._robot]
+        self._reach[:, radius[self._robot] == 0.0] = np.inf  # a half-space
+        places = 3 * np.concatenate([self._own, self._robot])[:, None] + np.arange(3)
+        self._places = StateReader(self._datas, {"places": numbers("geom_xpos", places)}) if self._reach.size else None
         known = {int(getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")) for kind in SOLIDS}
-        self._parts = {int(g): geom_part(model, int(g)) for g in self.robot if int(model.geom_type[g]) in known}
+        self._parts = {int(g): geom_part(model, int(g)) for g in self._robot if int(model.geom_type[g]) in known}
 
-    def rigid(self, data: mujoco.MjData) -> list[Inside]:
-        """Mirrored bodies inside the robot at the present poses (after ``mj_kinematics``)."""
-        result, radius = [], self.model.geom_rbound
-        for name, geoms in self.mirrors.items():
-            for own in geoms:
-                distance = np.linalg.norm(data.geom_xpos[self.robot] - data.geom_xpos[own], axis=1)
-                near = (distance < radius[self.robot] + radius[own]) | (radius[self.robot] == 0.0)
-                for geom in self.robot[near]:
-                    gap = mujoco.mj_geomDistance(self.model, data, int(own), int(geom), _REACH, None)
-                    if gap < 0.0:
-                        result.append(Inside(name, self._name(int(geom)), -float(gap)))
-        return result
+    def rigid(self, envs: Sequence[int] | range | np.ndarray) -> Iterator[tuple[int, Inside]]:
+        """Mirrored bodies inside the robot, by environment, at the present poses.
 
-    def soft(self, data: mujoco.MjData, name: str, vertices: np.ndarray) -> list[Inside]:
+        After ``mj_kinematics``.
+        """
+        if self._places is None:
+            return
+        chosen, own = np.asarray(envs, int), len(self._own)
+        places = self._places.values()["places"][chosen]
+        near = np.linalg.norm(places[:, :own, None] - places[:, None, own:], axis=3) < self._reach
+        for row, k, geom in np.argwhere(near).tolist():
+            b, robot = int(chosen[row]), int(self._robot[geom])
+            gap = mujoco.mj_geomDistance(self.model, self._datas[b], int(self._own[k]), robot, _REACH, None)
+            if gap < 0.0:
+                yield b, Inside(self._names[k], self._name(robot), -float(gap))
+
+    def soft(self, env: int, name: str, vertices: np.ndarray) -> list[Inside]:
         """Overlaps of a soft body with the robot, by its surface's vertices (n, 3) [m], world frame."""
-        result = []
+        result, data = [], self._datas[env]
         middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
         reach = float(np.linalg.norm(vertices - middle, axis=1).max())
         for geom, part in self._parts.items():

@@ -9,8 +9,9 @@ import drjit as dr
 import numpy as np
 import pytest
 
-from raytac.optics.geometry import CoatField
+from raytac.optics.geometry import CoatField, PixelSample, concave_cover
 from raytac.optics.runtime import load_mitsuba
+from raytac.optics.trace.direct import arrival
 from raytac.optics.trace.led import Lamp
 from raytac.optics.trace.occluders import Occluders, Wedge
 from raytac.specs.sensor import RefractionSpec, SensorSpec
@@ -105,6 +106,35 @@ def test_at_rest_nothing_is_walked(tracer: Build, spans: list[list[np.ndarray]],
     assert (found == 1).all() and all((span[:, 0] > span[:, 1]).all() for span in spans[0])
 
 
+@pytest.mark.parametrize("name", SPECS)
+def test_no_ray_is_lower_over_the_gel_than_its_block_says(tracer: Build, name: str) -> None:
+    """Least clearance along rays from random places, to 2 mm deep, to every place of an LED that is looked at."""
+    mode, spec = prepared(tracer, name), SPECS[name]
+    mi, own, grid, rng = mode.mi, mode._inputs.own, grid_of(spec), np.random.default_rng(7)
+    cover, tiling = concave_cover(grid), own.occluders.tiling
+    x, y = (rng.uniform(t[0], t[-1], 4000) for t in (grid.x, grid.y))
+
+    def rest(at_x: np.ndarray, at_y: np.ndarray) -> np.ndarray:
+        return cover[tuple(np.abs(t[:, None] - np.clip(v, t[0], t[-1])).argmin(0) for t, v in ((grid.y, at_y), (grid.x, at_x)))]
+
+    depth = rng.uniform(0.0, 2e-3, len(x))
+    p = mi.Point3f(*(mi.Float(v.astype(np.float32)) for v in (x, y, rest(x, y) - depth)))
+    block = np.array(tiling.block(mi, mi.UInt32(0), p.x, p.y))
+    seen = PixelSample(mi.UInt32(0), p, mi.Normal3f(0, 0, -1), mi.Vector3f(0, 0, -1))
+    for lamp, count, slopes in zip(own.lamps, own.shadow.counts, own.occluders.slopes, strict=True):
+        slope, fall, reach, _ = np.array(slopes).reshape(-1, 4)[block].T
+        counted, steps = np.minimum(depth, 1e-3), count * own.shadow.block**2
+        for k in range(steps):
+            u, density = lamp.sight(mi, p).at((k + 0.5) / steps)
+            light = arrival(mi, seen, lamp, lamp.point(u, 0), mode.slab)
+            to = [np.resize(np.array(v, float), x.shape) for v in light.target]
+            distance = np.hypot(to[0] - x, to[1] - y)
+            assert (distance <= 1.001 * reach).all()
+            ray = (rest(to[0], to[1]) - to[2] - depth) / distance - np.array(light.tangent(lamp, density / steps))
+            for s in np.linspace(0.02, 1.0, 9)[:, None] * distance:
+                assert (depth + ray * s >= counted + (slope - counted * fall) * s - 1e-7).all()
+
+
 def test_a_wedge_has_what_lies_towards_its_led() -> None:
     """Every point between a place of a disc and a place of the LED lies in the wedge from the disc's middle, and in its box."""
     mi = load_mitsuba("cpu")[0]
@@ -119,7 +149,7 @@ def test_a_wedge_has_what_lies_towards_its_led() -> None:
         centre, half = (np.array(v).ravel()[:2, None] for v in (lamp.centre, lamp.half_u))
         at = (1 - t) * p + t * (centre + u * half)
         dx, dy = (mi.Float(v.astype(np.float32)) for v in at - middle[:, None])
-        assert np.array(wedge.has(dx, dy, 1.001 * radius)).all()
+        assert np.array(wedge.has(dx, dy, 1.001 * radius, 1.001 * radius)).all()
         reach = float(np.linalg.norm(centre + u * half - middle[:, None], axis=0).max())
         box = [float(np.array(side)[0]) for side in wedge.box(mi.Float(reach), 1.001 * radius, 1e-3, 1e-3, 99, 99)]
         columns, rows = (v / 1e-3 for v in at - middle[:, None])
@@ -127,4 +157,4 @@ def test_a_wedge_has_what_lies_towards_its_led() -> None:
         away = middle - 3 * (centre[:, 0] - middle)
         if not bool(np.array(wedge.is_all)[0]) and np.linalg.norm(away - middle) > 0.1:
             dx, dy = (mi.Float(v) for v in away - middle)
-            assert not np.array(wedge.has(dx, dy, radius)).any()
+            assert not np.array(wedge.has(dx, dy, radius, radius)).any()

@@ -34,7 +34,7 @@ wp.set_module_options({"enable_backward": False})
 
 TILE_ENVS, TILE_OUT, TILE_IN = 32, 64, 32
 """Tile of the product of matrices: environments × outputs, inputs summed at a time."""
-TILES = 1000
+TILES = 3000
 """Tiles of a product that are computed at the same time; few alone wait for memory."""
 TILED_FROM = 8
 """Number of environments from which tiles are used instead of products with vectors."""
@@ -79,17 +79,25 @@ def multiply_vectors(
 
 
 @wp.kernel
-def place_running(running: IntArray, place: IntArray, total_running: IntArray):
-    """Numbers the running environments, so that products have no gaps; −1 for others."""
-    env = wp.tid()
+def place_running(running: IntArray, threads: wp.int32, place: IntArray, total_running: IntArray):
+    """Numbers the running environments, so that products have no gaps; −1 for others.
+
+    One block of threads.
+    """
+    lane = wp.tid()
     before = wp.int32(0)
-    for other in range(env):
-        before += running[other]
-    place[env] = -1
-    if running[env] != 0:
-        place[env] = before
-    if env == running.shape[0] - 1:
-        total_running[0] = before + running[env]
+    for first in range(0, running.shape[0], threads):
+        env = first + lane
+        runs = wp.int32(0)
+        if env < running.shape[0]:
+            runs = running[env]
+        flags = wp.tile(runs)
+        earlier = before + wp.untile(wp.tile_scan_exclusive(flags))
+        if env < running.shape[0]:
+            place[env] = wp.where(runs != 0, earlier, -1)
+        before += wp.tile_extract(wp.tile_sum(flags), 0)
+    if lane == 0:
+        total_running[0] = before
 
 
 @wp.kernel
@@ -420,7 +428,8 @@ class RestInverse:
         """z = M⁻¹ r for the running environments; arrays (B, N) of vec3d."""
         rest, inside, small, place = self.rest, self.inside, self.low_rank.small, self._place
         if tiled(self.batch, self.device):
-            self._launch(place_running, (self.batch,), [running], [place, self._total])
+            inputs, outputs = [running, BLOCK_THREADS], [place, self._total]
+            wp.launch(place_running, BLOCK_THREADS, inputs, outputs, device=self.device, block_dim=BLOCK_THREADS)
         if self.patched:
             self._launch(gather_inside, r.shape, [inside, r, running, place], [self.x_inside])
             self.to_interface.compute(running)

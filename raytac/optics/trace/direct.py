@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,14 +69,33 @@ def direct_light(
     point is the LED's middle. Radiance is that at the coat, without cast shadows.
     """
     diffuse, mirror = mi.Float(0), mi.Float(0)
+    is_line = slab is None and points.across == 1 and points.along > 1
+    for w, gain in _of_line(seen, lamp, points.along) if is_line else _of_points(mi, seen, lamp, points, slab):
+        diffuse += gain
+        if specular and coat.specular > 0:
+            mirror += gain * ggx(coat.roughness, seen.n, w, seen.wo)
+    return diffuse, mirror
+
+
+def _of_points(mi: Any, seen: PixelSample, lamp: Lamp, points: EdgePoints, slab: Slab | None) -> Iterator[tuple[Any, Any]]:
+    """(direction, weighted gain) of all points of an LED."""
     for u, weight in _along(mi, lamp, seen, points.along):
         for place, share in gauss(points.across):
             light = arrival(mi, seen, lamp, lamp.point(u, 2 * place - 1), slab)
-            gain = light.gain * weight * share
-            diffuse += gain
-            if specular and coat.specular > 0:
-                mirror += gain * ggx(coat.roughness, seen.n, light.w, seen.wo)
-    return diffuse, mirror
+            yield light.w, light.gain * weight * share
+
+
+def _of_line(seen: PixelSample, lamp: Lamp, points: int) -> Iterator[tuple[Any, Any]]:
+    """The same of points on the middle line, without a slab: by angles alone."""
+    fan = lamp.fan(seen.p)
+    facing, emitted = ([dr.dot(v, to) for to in (fan.middle, fan.beside)] for v in (seen.n, -lamp.axis))
+    for place, weight in gauss(points):
+        sine, cosine = dr.sincos(abs(place - 0.5) * fan.span) if place != 0.5 else (0, 1)
+        sine = sine if place > 0.5 else -sine
+        cos_p, cos_led = (cosine * m + sine * b for m, b in (facing, emitted))
+        lobe = lamp.lobe_at(cos_led)
+        gain = dr.select((lobe > 0) & (cos_p > 0), lobe * cos_p * (weight * fan.span * fan.density), 0)
+        yield cosine * fan.middle + sine * fan.beside, gain
 
 
 def _along(mi: Any, lamp: Lamp, seen: PixelSample, points: int) -> Sequence[tuple[Any, Any]]:

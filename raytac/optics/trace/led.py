@@ -12,6 +12,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from raytac.optics.power import power
 from raytac.optics.trace.quadrature import quadrature
 from raytac.specs.sensor import LedSpec
 
@@ -50,6 +51,22 @@ class Sight:
         tangent = dr.tan(self.start + share * self.span)
         u = dr.clip((self.distance * tangent - self.foot) / self.half, -1, 1)
         return u, 0.5 * self.span * self.distance * (1 + tangent * tangent) / self.half
+
+
+@dataclass(frozen=True)
+class Fan:
+    """Directions from p to a segment, which spans the angle ``span`` [rad].
+
+    At the angle δ from the middle of it the direction is ``middle`` cos δ + ``beside`` sin δ. A stretch dδ of the segment at the distance r
+    is dδ r² / h long, with the distance h of its line. So light that falls off as 1 / r² depends on the direction alone.
+    """
+
+    middle: Any
+    beside: Any
+    """Unit vectors."""
+    span: Any
+    density: Any
+    """Share of the segment's length over r² by δ [1/m² per rad]."""
 
 
 @dataclass(frozen=True)
@@ -105,10 +122,32 @@ class Lamp:
         start = dr.atan2(foot - half, distance)
         return Sight(half, foot, distance, start, dr.atan2(foot + half, distance) - start)
 
+    def fan(self, p: Any) -> Fan:
+        """Directions from ``p`` to the longer edge's middle line."""
+        length = dr.squared_norm(self.half_u)
+        per_half = dr.rsqrt(length)  # roots and divisions take as long as ten products
+        half, along, q = length * per_half, self.half_u * per_half, self.centre - p
+        foot = dr.dot(q, along)
+        across = q - foot * along
+        square = dr.maximum(dr.squared_norm(across), 1e-12)
+        inverse = dr.rsqrt(square)
+        distance, across = square * inverse, across * inverse
+        first, last = foot - half, foot + half
+        near, far = dr.rsqrt(square + first * first), dr.rsqrt(square + last * last)
+        # Unit vectors to both ends add up to one in the middle of their angle.
+        cosine, sine = distance * (near + far), first * near + last * far
+        unit = dr.rsqrt(cosine * cosine + sine * sine)
+        cosine, sine = cosine * unit, sine * unit
+        span = dr.atan2(2 * half * distance, square + first * last)
+        return Fan(cosine * across + sine * along, cosine * along - sine * across, span, 0.5 * inverse * per_half)
+
     def lobe_gain(self, direction: Any) -> Any:
         """cosⁿ θ for light leaving along the unit ``direction``; 0 behind."""
-        cos_theta = dr.dot(direction, self.axis)
-        return dr.select(cos_theta > 0, lobe_gain(dr, cos_theta, self.lobe), 0)
+        return self.lobe_at(dr.dot(direction, self.axis))
+
+    def lobe_at(self, cos_theta: Any) -> Any:
+        """The same by the cosine."""
+        return dr.select(cos_theta > 0, power(dr.maximum(cos_theta, LEAST_COSINE), self.lobe), 0)
 
 
 _PICKED = ("centre", "axis", "half_u", "half_v", "lobe", "power")

@@ -24,9 +24,13 @@ from raytac.optics.trace.led import Lamp
 from raytac.optics.trace.shadow_ray import Depths, DepthTiling
 
 _LOW = 1.0e-3
-"""Indentation [m] at which slopes are taken too."""
+"""Indentation [m] at which slopes are taken too; deeper places count as if they were there."""
+_SURE = 0.05
+"""Share of a slope, or of a distance, by which it may differ between the samples of a block."""
 _SLACK = 1.25
 """Largest half angle of a piece of an LED over that of the samples of a block."""
+_NEAR = 1e-5
+"""Least distance of an LED that counts [m]."""
 _FAR = 1e3
 """Distance of a blocker that does not exist [m]."""
 
@@ -37,7 +41,9 @@ class Occluders:
 
     tiling: DepthTiling
     slopes: list[Any]
-    """(slope from the gel at rest, its fall by indentation [1/m]) of blocks, an array an LED."""
+    """(slope from the gel at rest, its fall by indentation [1/m], largest distance [m], 0).
+
+    Of blocks, an array an LED; the distance is that of the LED."""
 
     @classmethod
     def build(
@@ -55,25 +61,28 @@ class Occluders:
         ``rest``: heights [m] of the concave cover of the gel at rest, (Ny, Nx).
         """
         x, y, z = _places(tiling, rest)
-        slopes = []
+        slopes, (width, height) = [], tiling.block_edges
+        spacing = float(np.hypot(width / 2 + tiling.margin, height / 2 + tiling.margin))
         for lamp, count in zip(lamps, counts, strict=True):
-            middle, half = (np.array(v).ravel() for v in (lamp.centre, lamp.half_u))
-            along = middle + np.linspace(-1, 1, 33)[:, None] * half
-            height = _nearest(tiling.layout, rest, along[:, 0], along[:, 1]).min() - along[:, 2].max()
-            ends = [middle + sign * half for sign in (-1, 1)]
-            reach = np.max([np.hypot(x - end[0], y - end[1]).max(axis=1) for end in ends], axis=0)
-            tangent = np.zeros(len(x))
-            for depth in (0.0, _LOW):
-                p = mi.Point3f(*(mi.Float(values.astype(np.float32).ravel()) for values in (x, y, z - depth)))
-                seen, sight = PixelSample(mi.UInt32(0), p, mi.Normal3f(0, 0, -1), mi.Vector3f(0, 0, -1)), lamp.sight(mi, p)
-                most = mi.Float(0)
-                for k in range(count * parts):
-                    u, density = sight.at((k + 0.5) / (count * parts))
-                    light = arrival(mi, seen, lamp, lamp.point(u, 0), slab)
-                    most = dr.maximum(most, light.tangent(lamp, density / (count * parts)))
-                tangent = np.maximum(tangent, np.array(most).reshape(x.shape).max(axis=1))
-            bounds = np.stack([height / reach - _SLACK * tangent, 1 / reach], axis=-1)
-            slopes.append(mi.Float(bounds.astype(np.float32).ravel()))
+            least, reach, nearest = np.full((2, *x.shape), np.inf), np.zeros(x.shape), np.full(x.shape, np.inf)
+            seen = [_seen(mi, x, y, z - depth) for depth in (0.0, _LOW)]
+            for k in range(count * parts):
+                lights = []
+                for here in seen:
+                    u, density = lamp.sight(mi, here.p).at((k + 0.5) / (count * parts))
+                    lights.append((arrival(mi, here, lamp, lamp.point(u, 0), slab), density / (count * parts)))
+                half = np.max([np.resize(np.array(light.tangent(lamp, share)), x.shape) for light, share in lights], axis=0)
+                for n, (light, _) in enumerate(lights):
+                    to_x, to_y, to_z = (np.resize(np.array(v, float), x.shape) for v in light.target)
+                    distance = np.maximum(np.hypot(to_x - x, to_y - y), _NEAR)
+                    slope = (_nearest(tiling.layout, rest, to_x, to_y) - to_z - n * _LOW) / distance
+                    least[n] = np.minimum(least[n], slope - _SURE * np.abs(slope) - _SLACK * half)
+                    reach, nearest = np.maximum(reach, distance), np.minimum(nearest, distance)
+            least[:, nearest.min(axis=1) < spacing] = -_FAR  # right under the LED samples are too few
+            flat, deep = least.min(axis=2)
+            # Of each ray it falls in proportion to depth. So the least of all is concave: above its chord.
+            bounds = [flat, (flat - deep) / _LOW, (1 + _SURE) * reach.max(axis=1), 0 * flat]
+            slopes.append(mi.Float(np.stack(bounds, axis=-1).astype(np.float32).ravel()))
         return cls(tiling, slopes)
 
     def spans(self, mi: Any, depths: Depths, lamps: Sequence[Lamp]) -> list[Any]:
@@ -87,16 +96,19 @@ class Occluders:
         block, env = i % (columns * rows), i // (columns * rows)
         ix, iy = mi.Int32(block % columns), mi.Int32(block // columns)
         x, y = g.x0 + (mi.Float(ix) + 0.5) * width, g.y0 + (mi.Float(iy) + 0.5) * height
-        shallow, deepest = dr.gather(mi.Vector2f, depths.blocks, i).y, dr.gather(mi.Float, depths.deepest, env)
+        shallow = dr.minimum(dr.gather(mi.Vector2f, depths.blocks, i).y, _LOW)
+        deepest = dr.gather(mi.Float, depths.deepest, env)
         own = float(np.hypot(width / 2 + t.margin, height / 2 + t.margin))
         both = own + float(np.hypot(width, height)) / 2
+        # Displacements between places of two blocks fill a rectangle with these half edges about that of their centres.
+        half_x, half_y = width + t.margin, height + t.margin
         result = []
         for lamp, slopes in zip(lamps, self.slopes, strict=True):
-            bound = dr.gather(mi.Vector2f, slopes, block)
+            bound = dr.gather(mi.Vector4f, slopes, block)
             gain = bound.x - dr.maximum(shallow, 0) * bound.y
             wedge = Wedge.of(mi, lamp, x, y, own)
             # What is farther away is not deep enough, or beyond the LED.
-            most = dr.minimum(dr.select(gain > 0, (deepest - shallow) / gain, _FAR), 1 / bound.y)
+            most = dr.minimum(dr.select(gain > 0, (deepest - shallow) / gain, _FAR), bound.z)
             x0, x1, y0, y1 = (mi.Int32(n) for n in wedge.box(most, both, width, height, columns, rows))
             y1 = dr.select(deepest > shallow, y1, y0 - 1)
 
@@ -106,10 +118,12 @@ class Occluders:
                 j = mi.UInt32((mi.Int32(env) * rows + jy) * columns + jx)
                 depth = dr.gather(mi.Vector2f, depths.blocks, j, is_block).x
                 dx, dy = mi.Float(ox) * width, mi.Float(oy) * height
-                distance = dr.sqrt(dx * dx + dy * dy)
-                near, far = dr.maximum(distance - both, min(g.dx, g.dy)), distance + both
+                from_x, from_y = dr.maximum(dr.abs(dx) - half_x, 0), dr.maximum(dr.abs(dy) - half_y, 0)
+                to_x, to_y = dr.abs(dx) + half_x, dr.abs(dy) + half_y
+                near = dr.maximum(dr.sqrt(from_x * from_x + from_y * from_y), min(g.dx, g.dy))
+                far = dr.sqrt(to_x * to_x + to_y * to_y)
                 clearance = shallow + dr.minimum(gain * near, gain * far)  # noqa: B023
-                blocks = is_block & wedge.has(dx, dy, both) & (depth > clearance)  # noqa: B023
+                blocks = is_block & wedge.has(dx, dy, half_x, half_y) & (depth > clearance)  # noqa: B023
                 first = dr.select(blocks, dr.minimum(first, near), first)
                 last, deep = (dr.select(blocks, dr.maximum(old, new), old) for old, new in ((last, far), (deep, depth)))
                 ends = ox >= x1  # noqa: B023
@@ -149,11 +163,16 @@ class Wedge:
         a, b = (dr.rsqrt(dr.maximum(vx * vx + vy * vy, 1e-12)) for vx, vy in ((ax, ay), (bx, by)))
         return cls(ax * a, ay * a, bx * b, by * b, px * px + py * py <= radius * radius)
 
-    def has(self, dx: Any, dy: Any, radius: float) -> Any:
-        """True if the wedge comes within ``radius`` [m] of the displacement (dx, dy) [m]."""
-        is_left = self.ax * dy - self.ay * dx > -radius
-        is_right = self.bx * dy - self.by * dx < radius
-        is_ahead = (self.ax + self.bx) * dx + (self.ay + self.by) * dy > -2 * radius
+    def has(self, dx: Any, dy: Any, half_x: float, half_y: float) -> Any:
+        """True if the wedge meets the rectangle about (dx, dy) [m], of these half edges [m]."""
+
+        def reach(ux: Any, uy: Any) -> Any:
+            return dr.abs(ux) * half_x + dr.abs(uy) * half_y
+
+        cx, cy = self.ax + self.bx, self.ay + self.by
+        is_left = self.ax * dy - self.ay * dx > -reach(self.ay, self.ax)
+        is_right = self.bx * dy - self.by * dx < reach(self.by, self.bx)
+        is_ahead = cx * dx + cy * dy > -reach(cx, cy)
         return self.is_all | (is_left & is_right & is_ahead)
 
     def box(self, most: Any, radius: float, width: float, height: float, columns: int, rows: int) -> list[Any]:
@@ -168,6 +187,11 @@ class Wedge:
                 reach = dr.select(is_between, 1, dr.maximum(along, 0)) * most + radius
                 sides.append(sign * dr.minimum(dr.ceil(reach / edge), count))
         return sides
+
+
+def _seen(mi: Any, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> PixelSample:
+    p = mi.Point3f(*(mi.Float(values.astype(np.float32).ravel()) for values in (x, y, z)))
+    return PixelSample(mi.UInt32(0), p, mi.Normal3f(0, 0, -1), mi.Vector3f(0, 0, -1))
 
 
 def _places(t: DepthTiling, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

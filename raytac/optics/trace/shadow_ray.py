@@ -18,7 +18,7 @@ TILE = 0.25e-3
 """Edge of a tile [m], about: a ray looks at or skips a stretch of that length."""
 MOST_CELLS = 8
 """Most cells along an edge of a tile."""
-BLOCK = 6
+BLOCK = 4
 """Tiles along each side of a block (``Occluders``)."""
 
 

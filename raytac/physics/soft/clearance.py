@@ -36,6 +36,7 @@ class BarrierClearance:
 
     Attributes:
         clearance: [m], (B,), float64; NaN out of contact.
+        lattice: the coat's height over rest on the surface's lattice [m], of the last ``measure``.
     """
 
     def __init__(self, surface: CoatSurface, samples: PadGrid, d_hat: float, products: Products) -> None:
@@ -50,7 +51,7 @@ class BarrierClearance:
         count, ny = products.num_envs, samples.shape[0]
         self.undersides = Undersides(samples, float(samples.rest.max()) + 10.0 * d_hat, count, device)
         self._spare = products.zeros(ny, surface.lattice[1])
-        self._rise, self._lattice = products.zeros(*samples.shape), products.zeros(*surface.lattice)
+        self._rise, self.lattice = products.zeros(*samples.shape), products.zeros(*surface.lattice)
         self._mean, self._pressure = (wp.zeros((count, len(mesh.rest)), dtype=wp.float64, device=device) for _ in range(2))
         self._lowest_rows = wp.zeros((count, ny), dtype=wp.float64, device=device)
         self._lowest, self.clearance = (wp.zeros(count, dtype=wp.float64, device=device) for _ in range(2))
@@ -63,8 +64,8 @@ class BarrierClearance:
         ``forces``: (B, V) of ``vec3d`` [N]; ``sound``: 1 in environments (B,), int32, that are read.
         """
         columns, under = self._surface.mesh.shape[1], self.undersides.under
-        self._surface.rise(self._lattice)
-        self._products.sandwich(self._rows, self._lattice, self._columns, self._spare, self._rise)
+        self._surface.rise(self.lattice)
+        self._products.sandwich(self._rows, self.lattice, self._columns, self._spare, self._rise)
         self.undersides.find(objects, sound, self._unmoved)
         self.undersides.remove_behind(objects, self._rise.numbers, self._unmoved)
         self._launch(kernels.pressures, forces.shape, [self._surface.struct, sound, forces, self._pressure])

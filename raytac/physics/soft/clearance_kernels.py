@@ -79,8 +79,10 @@ def pressures(coat: Coat, sound: wp.array(dtype=wp.int32), forces: wp.array2d(dt
 def lowest_in_rows(under: wp.array3d(dtype=wp.float64), lowest: wp.array2d(dtype=wp.float64)):
     env, row = wp.tid()
     least = infinity()
-    for i in range(under.shape[2]):
+    i, end = wp.int32(0), under.shape[2]
+    while i < end:
         least = wp.min(least, under[env, row, i])
+        i += 1
     lowest[env, row] = least
 
 
@@ -108,10 +110,12 @@ def mean_over_cells(
     rows, nodes = hats.around_y[v // columns], hats.around_x[v % columns]
     total, weight = wp.float64(0.0), wp.float64(0.0)
     for row in range(rows[0], rows[1]):
-        for i in range(nodes[0], nodes[1]):
+        i, end = wp.max(nodes[0], 0), nodes[1]
+        while i < end:
             w = hat(hats.cell_y[row], hats.share_y[row], v // columns) * hat(hats.cell_x[i], hats.share_x[i], v % columns)
             total += w * wp.min(under[env, row, i], highest)
             weight += w
+            i += 1
     mean[env, v] = total / wp.max(weight, wp.float64(1e-6))
 
 
@@ -131,7 +135,8 @@ def gaps_in_rows(
     env, row = wp.tid()
     total, weight, overlap = wp.float64(0.0), wp.float64(0.0), -infinity()
     highest = lowest[env] + _CUT
-    for i in range(under.shape[2]):
+    i, end = wp.int32(0), under.shape[2]
+    while i < end:
         z = under[env, row, i]
         overlap = wp.max(overlap, rest[row, i] - z)
         p = between_vertices(hats, columns, pressure, env, row, i)
@@ -141,6 +146,7 @@ def gaps_in_rows(
             if gap < reach[row, i] + _SAG * bulge:
                 total += p * gap
                 weight += p
+        i += 1
     sums[env, row] = wp.vec3d(total, weight, overlap)
 
 

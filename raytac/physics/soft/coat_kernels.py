@@ -136,8 +136,10 @@ def bend_rows(coat: Coat, values: wp.array3d(dtype=wp.float64), fields: wp.array
     columns = coat.lines_x.shape[0]
     first, i = (v // columns) * columns, v % columns
     total = wp.float64(0.0)
-    for m in range(columns):
+    m = wp.int32(0)
+    while m < columns:
         total += values[env, c, first + m] * coat.bending_x[i, m]
+        m += 1
     fields[env, c, 0, v] = values[env, c, v]
     fields[env, c, 1, v] = total
 
@@ -149,10 +151,12 @@ def bend_columns(coat: Coat, fields: wp.array4d(dtype=wp.float64)):
     columns, rows = coat.lines_x.shape[0], coat.lines_y.shape[0]
     j, i = v // columns, v % columns
     value, bent = wp.float64(0.0), wp.float64(0.0)
-    for m in range(rows):
+    m = wp.int32(0)
+    while m < rows:
         w = coat.bending_y[j, m]
         value += w * fields[env, c, 0, m * columns + i]
         bent += w * fields[env, c, 1, m * columns + i]
+        m += 1
     fields[env, c, 2, v] = value
     fields[env, c, 3, v] = bent
 

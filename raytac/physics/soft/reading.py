@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from raytac.gel.coat_mesh import DeformedCoat
-from raytac.gel.products import Products
+from raytac.gel.products import Matrices, Products
 from raytac.gel.surface import GelSurface, PadGrid, make_grid
 from raytac.physics.soft import reading_kernels as kernels
 from raytac.physics.soft.clearance import BarrierClearance, hat_arrays
@@ -198,39 +199,34 @@ class _Batch:
         samples = make_grid(gelpad, max(_SAMPLE, *grid.pitch))
         self._clearance = BarrierClearance(self._surface, samples, mesh.d_hat, products)
         self._rows, self._columns = self._surface.matrices(grid.x, grid.y)
-        self._lattice = products.zeros(*self._surface.lattice)
+        self._lattice = self._clearance.lattice
         self._half_product = products.zeros(grid.shape[0], self._surface.lattice[1])
         self._rise = products.zeros(*grid.shape)
         self._undersides = Undersides(grid, float(grid.rest.max()), num_envs, self._device)
         self._rest = self._on_device(grid.rest, wp.float64)
         self._hats, self._lines = hat_arrays(mesh.coat, grid.x, grid.y, self._device), node_lines(grid.x, grid.y)
         vertices = len(mesh.coat.rest)
-        self._sound, self._load = self._zeros(num_envs, dtype=wp.int32), self._zeros(num_envs, vertices, dtype=wp.float64)
+        self._sound, self._plain = (self._zeros(num_envs, dtype=wp.int32) for _ in range(2))
+        self._load = self._zeros(num_envs, vertices, dtype=wp.float64)
         self._solved, self._none_failed = self._zeros(0, dtype=wp.float64), self._zeros(num_envs, dtype=wp.bool)
         self._height, self._contact = (self._zeros(num_envs, *grid.shape, dtype=dtype) for dtype in (wp.float32, wp.uint8))
         self._single_rest = self._on_device(grid.rest[None].astype(np.float32), wp.float32)
         self._coat, self._centre = self._zeros(num_envs, vertices, dtype=wp.vec3d), self._zeros(num_envs, dtype=wp.vec2d)
         self.unread = self._zeros(num_envs, dtype=wp.bool)
-        self._state: CoatState | None = None
-        self._recorded: Recorded | None = None
-        self._shown: Any = None
+        self._measured, self._shown = (_Repeated(f, self._device) for f in (self._launch_clearance, self._launch_all))
         self._residual, self._failed = self._zeros(num_envs, dtype=wp.float64), self._zeros(num_envs, dtype=wp.bool)
 
     def measure(self, state: CoatState) -> wp.array:
         """Launch the clearance of all environments [m], (B,)."""
-        self._find_sound(state, self._none_failed)
-        return self._measure(state)
+        return self._measured(state)
 
     def read(self, state: CoatState) -> PadArrays:
         """Show a state, but for the environments ``unread``."""
-        if self._state is not state:
-            self._state, self._recorded = state, None
-            self._shown = self._launch_all(state)
-            return self._shown
-        if self._recorded is None:
-            self._recorded = Recorded(partial(self._launch_all, state), device=self._device)
-        self._recorded()
-        return self._shown
+        return self._shown(state)
+
+    def _launch_clearance(self, state: CoatState) -> wp.array:
+        self._find_sound(state, self._none_failed)
+        return self._measure(state)
 
     def _launch_all(self, state: CoatState) -> PadArrays:
         """Launch all that is shown."""
@@ -238,20 +234,20 @@ class _Batch:
         lines, under = self._height.shape[:2], self._undersides
         self._find_sound(state, self.unread)
         clearance = self._measure(state)
-        self._surface.rise(self._lattice)
-        self._products.sandwich(self._rows, self._lattice, self._columns, self._half_product, self._rise)
+        plain: Any = self._plain if correction is not None and correction.normal else None
+        self._launch(kernels.choose_plain, len(sound), [clearance, state.objects.touching, self._plain])
+        self._products.sandwich(self._rows, self._lattice, self._columns, self._half_product, self._rise, active=plain)
         under.find(state.objects, sound, clearance)
         under.remove_behind(state.objects, self._rise.numbers, clearance)
         if correction is None:
             self._launch(normal_kernels.loads, self._load.shape, [sound, state.forces, clearance, self._load])
-            fields = [self._load, clearance, self._rest, self._rise.numbers, under.under, self._height, self._contact]
+            fields = [self._load, clearance, self._rest, self._rise.numbers, under.under, self._height, self._contact, sound]
             columns, d_hat = self._reader.mesh.coat.shape[1], self._reader.mesh.d_hat
             self._launch(kernels.show_plain, lines, [self._hats, columns, d_hat, *fields])
             wp.copy(self._coat, state.vertices)
         else:
             self._correct(state, clearance, correction)
         self._launch(kernels.find_centres, len(sound), [sound, clearance, state.forces, state.vertices, self._centre])
-        self._launch(kernels.lose_heights, lines, [self._height, sound])
         self._launch(kernels.find_sound_surfaces, self._coat.shape, [self._coat, sound])
         self._launch(kernels.hide_nodes, lines, [sound, self._height, self._contact, under.under])
         hidden = [self._coat, clearance, self._centre, self._residual, self._failed]
@@ -278,11 +274,10 @@ class _Batch:
     def _correct(self, state: CoatState, clearance: wp.array, correction: Correction) -> None:
         """Launch the correction of height, contact and coat."""
         normal, sampler, tangential, fine = self._stages
-        rise, sound, lines = self._rise.numbers, self._sound, self._height.shape[:2]
-        under = self._undersides.under
+        sound, lines, under = self._sound, self._height.shape[:2], self._undersides.under
         if fine is not None:
             finer, rows, columns, lattice, risen = fine
-            self._products.sandwich(rows, self._lattice, columns, lattice, risen)
+            self._products.sandwich(rows, self._lattice, columns, lattice, risen, active=self._plain)
             finer.find(state.objects, sound, clearance)
             finer.remove_behind(state.objects, risen.numbers, clearance)
             under = finer.under
@@ -292,16 +287,10 @@ class _Batch:
         if fine is not None:
             normal_rise = self._normal_rise
             self._products.sandwich(self._rows, normal.rise, self._columns, self._half_product, normal_rise)
-        laid = [int(correction.normal), correction.closed_gap, clearance, *sampler.nearest, normal.pressure.numbers, self._rest]
-        fields = [
-            rise,
-            normal_rise.numbers,
-            sampler.dent(normal).numbers,
-            self._undersides.under,
-            self._height,
-            self._contact,
-        ]
-        self._launch(normal_kernels.lay, lines, [*laid, *fields])
+        laid = [normal.search, int(correction.normal), correction.closed_gap, clearance, *sampler.nearest]
+        fields = [normal.pressure, self._rest, self._rise, normal_rise, sampler.dent(normal), self._undersides.under]
+        numbers = [one.numbers if isinstance(one, Matrices) else one for one in fields]
+        self._launch(normal_kernels.lay, lines, [*laid, *numbers, self._height, self._contact, sound])
         tangential.correct(state.objects)
         heights = [self._height, self._single_rest]
         placed = [clearance, tangential.displacement, self._lines, *heights, state.vertices, self._coat]
@@ -335,3 +324,23 @@ class _Batch:
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, device=self._device)
+
+
+class _Repeated:
+    """Launches for a state: one by one, and from the second time on for the same state as one recording."""
+
+    def __init__(self, launch: Callable[[CoatState], Any], device: Any) -> None:
+        """``launch``: returns the same arrays every time."""
+        self._launch, self._device = launch, device
+        self._state: CoatState | None = None
+        self._recorded: Recorded | None = None
+        self._result: Any = None
+
+    def __call__(self, state: CoatState) -> Any:
+        if self._state is not state:
+            self._state, self._recorded, self._result = state, None, self._launch(state)
+        else:
+            if self._recorded is None:
+                self._recorded = Recorded(partial(self._launch, state), device=self._device)
+            self._recorded()
+        return self._result

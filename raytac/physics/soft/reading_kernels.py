@@ -59,24 +59,47 @@ def find_sound_surfaces(vertices: wp.array2d(dtype=wp.vec3d), sound: wp.array(dt
 
 
 @wp.kernel
+def choose_plain(
+    clearance: wp.array(dtype=wp.float64), touching: wp.array2d(dtype=wp.bool),
+    # outputs
+    plain: wp.array(dtype=wp.int32),
+):  # fmt: skip
+    """1 where the plain height counts: out of contact, or below several objects."""
+    env = wp.tid()
+    count = wp.int32(0)
+    for k in range(touching.shape[1]):
+        if touching[env, k]:
+            count += 1
+    plain[env] = wp.where(wp.isfinite(clearance[env]) and count < 2, 0, 1)
+
+
+@wp.kernel
 def show_plain(
     hats: Hats, columns: wp.int32, d_hat: wp.float64, load: wp.array2d(dtype=wp.float64), clearance: wp.array(dtype=wp.float64),
     rest: wp.array2d(dtype=wp.float64), rise: wp.array3d(dtype=wp.float32), under: wp.array3d(dtype=wp.float64),
     # outputs
     height: wp.array3d(dtype=wp.float32),
     contact: wp.array3d(dtype=wp.uint8),
+    sound: wp.array(dtype=wp.int32),
 ):  # fmt: skip
-    """Height without correction along a row, and contact where loaded vertices are near."""
+    """Height without correction along a row, and contact where loaded vertices are near.
+
+    An environment with a height that is not finite is not ``sound``.
+    """
     env, row = wp.tid()
     touched = wp.isfinite(clearance[env])
-    for i in range(height.shape[2]):
+    i, end = wp.int32(0), height.shape[2]
+    while i < end:
         z = wp.float32(rest[row, i] + wp.float64(rise[env, row, i]))
         height[env, row, i] = z
+        if not wp.isfinite(z):
+            sound[env] = 0
         mark = wp.uint8(0)
         bears = between_vertices(hats, columns, load, env, row, i) > _0
         if touched and bears and under[env, row, i] - wp.float64(z) < d_hat:
             mark = wp.uint8(1)
         contact[env, row, i] = mark
+        i += 1
 
 
 @wp.kernel
@@ -117,16 +140,6 @@ def find_centres(
         total += load
         middle += load * wp.vec2d(vertices[env, v][0], vertices[env, v][1])
     centre[env] = middle / total
-
-
-@wp.kernel
-def lose_heights(height: wp.array3d(dtype=wp.float32), sound: wp.array(dtype=wp.int32)):
-    """0 in environments in which a height is not finite, by (environment, row)."""
-    env, row = wp.tid()
-    line = height[env, row]
-    for i in range(height.shape[2]):
-        if not wp.isfinite(line[i]):
-            sound[env] = 0
 
 
 @wp.kernel

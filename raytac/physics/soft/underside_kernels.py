@@ -55,15 +55,19 @@ def underside_of_parts(shapes: Shapes, nodes: Nodes, before: Before, under: wp.a
     """Lowest z [m] of all parts along one row of nodes, by (environment, row); inf for none."""
     env, row = wp.tid()
     y = nodes.y[row]
-    for i in range(under.shape[2]):
+    i, end = wp.int32(0), under.shape[2]
+    while i < end:
         under[env, row, i] = infinity()
+        i += 1
     for part in range(before.window.shape[1]):
         window = before.window[env, part]
         if row >= window[2] and row < window[3]:
             rotation, at = before.rotation[env, part], before.at[env, part]
-            for i in range(window[0], window[1]):
+            i, end = wp.max(window[0], 0), window[1]
+            while i < end:
                 z = first_hit(shapes, part, rotation, at, nodes.x[i], y)
                 under[env, row, i] = wp.min(under[env, row, i], z)
+                i += 1
 
 
 @wp.func
@@ -139,6 +143,8 @@ def remove_behind(
             count += 1
     if count < 2 or not wp.isfinite(clearance[env]):
         return
-    for i in range(under.shape[2]):
+    i, end = wp.int32(0), under.shape[2]
+    while i < end:
         if under[env, row, i] < rest[row, i] + wp.float64(rise[env, row, i]) - _BEHIND:
             under[env, row, i] = infinity()
+        i += 1

@@ -71,8 +71,10 @@ def solve_in_one_block(
         while i < n:
             row = unknowns.index[env, i]
             total = wp.float64(0.0)
-            for k in range(n):
+            k = wp.int32(0)
+            while k < n:
                 total += matrix[row, unknowns.index[env, k]] * p[env, k]
+                k += 1
             Ap[env, i] = total
             a += p[env, i] * total
             i += threads
@@ -109,9 +111,11 @@ def respond(
     """Matrix times forces, (B, rows), by (environment, row); free unknowns alone have forces."""
     env, row = wp.tid()
     total = wp.float64(0.0)
-    for k in range(unknowns.count[env]):
+    k, end = wp.int32(0), unknowns.count[env]
+    while k < end:
         number = unknowns.index[env, k]
         total += matrix[row, number] * forces[env, number]
+        k += 1
     moved[env, row] = total
 
 

@@ -123,7 +123,8 @@ def overlaps(
     env, row = wp.tid()
     from_, to = rise.shape[2], wp.int32(0)
     above, at_rest, risen, overlapped = under[env, row], rest[row], rise[env, row], overlap[env, row]
-    for i in range(rise.shape[2]):
+    i, end = wp.int32(0), rise.shape[2]
+    while i < end:
         clear = above[i] - at_rest[i]
         if not (clear < _INF):
             clear = open_gap
@@ -131,6 +132,7 @@ def overlaps(
         overlapped[i] = wp.float32(u)
         if u > -clear_gap:
             from_, to = wp.min(from_, i), wp.max(to, i + 1)
+        i += 1
     near[env, row] = wp.vec2i(from_, to)
 
 
@@ -176,13 +178,15 @@ def first_pressures(
     env, row = wp.tid()
     if row < s.rows[env][0] or row >= s.rows[env][1]:
         return
-    for i in range(s.columns[env][0], s.columns[env][1]):
+    i, end = wp.max(s.columns[env][0], 0), s.columns[env][1]
+    while i < end:
         corner = hats.cell_y[row] * wide + hats.cell_x[i]
         a, b = hats.share_x[i], hats.share_y[row]
         one = wp.float64(1.0)
         p = (one - b) * ((one - a) * load[env, corner] + a * load[env, corner + 1])
         p += b * ((one - a) * load[env, corner + wide] + a * load[env, corner + wide + 1])
         pressure[env, row, i] = wp.float32(p * hats.area_x[i] * hats.area_y[row])
+        i += 1
 
 
 @wp.kernel
@@ -210,16 +214,20 @@ def begin(
     columns, rows = s.columns[env], s.rows[env]
     is_in = row >= rows[0] and row < rows[1]
     pressure, kept, direction, overlapped = p[env, row], best[env, row], t[env, row], overlap[env, row]
-    for i in range(p.shape[2]):
+    i, end = wp.int32(0), p.shape[2]
+    while i < end:
         pressure[i] = _ZERO
         kept[i] = _ZERO
         direction[i] = _ZERO
+        i += 1
     if is_in:
-        for i in range(columns[0], columns[1]):
+        i, end = wp.max(columns[0], 0), columns[1]
+        while i < end:
             if overlapped[i] > _ZERO:
                 value = wp.max(start[env, row, i], greatest[env] * wp.float32(1e-3))
                 pressure[i] = value
                 kept[i] = value
+            i += 1
     overlapping[env, row] = 1
 
 
@@ -236,25 +244,22 @@ def gaps(
     if s.active[env] == 0 or row < rows[0] or row >= rows[1]:
         return
     least, most = wp.float32(1e30), wp.float32(0.0)
-    for i in range(columns[0], columns[1]):
+    i, end = wp.max(columns[0], 0), columns[1]
+    while i < end:
         gap = dent[env, row, i] - overlap[env, row, i]
         g[env, row, i] = gap
         least = wp.min(least, gap)
         if p[env, row, i] > _ZERO:
             most = wp.max(most, wp.abs(gap))
+        i += 1
     sums[env, row] = wp.vec3d(wp.float64(least), wp.float64(most), _0)
 
 
 @wp.func
-def pressed(
-    s: Search, env: wp.int32, row: wp.int32, i: wp.int32, g: wp.array3d(dtype=wp.float32), p: wp.array3d(dtype=wp.float32)
-):
-    """g at a node under pressure, 0 elsewhere."""
-    columns, rows = s.columns[env], s.rows[env]
-    if row < rows[0] or row >= rows[1] or i < columns[0] or i >= columns[1]:
-        return wp.float32(0.0)
-    if p[env, row, i] > _ZERO:
-        return g[env, row, i]
+def pressed(is_in: wp.bool, p: wp.array(dtype=wp.float32), g: wp.array(dtype=wp.float32), i: wp.int32):
+    """g at a node of a row under pressure, 0 at others and outside of the window."""
+    if is_in and p[i] > _ZERO:
+        return g[i]
     return wp.float32(0.0)
 
 
@@ -273,14 +278,18 @@ def stiffen(
     columns, rows = s.columns[env], s.rows[env]
     if s.active[env] == 0 or row < rows[0] or row >= rows[1]:
         return
+    upper, lower = wp.max(row - 1, rows[0]), wp.min(row + 1, rows[1] - 1)
+    p0, p1, p2, g0, g1, g2 = p[env, upper], p[env, row], p[env, lower], g[env, upper], g[env, row], g[env, lower]
     total = wp.float64(0.0)
-    for i in range(columns[0], columns[1]):
-        if p[env, row, i] > _ZERO:
-            around = pressed(s, env, row - 1, i, g, p) + pressed(s, env, row + 1, i, g, p)
-            around += pressed(s, env, row, i - 1, g, p) + pressed(s, env, row, i + 1, g, p)
-            value = (wp.float32(4.0) + shortest) * g[env, row, i] - around
+    i, end = wp.max(columns[0], 0), columns[1]
+    while i < end:
+        if p1[i] > _ZERO:
+            around = pressed(upper < row, p0, g0, i) + pressed(lower > row, p2, g2, i)
+            around += pressed(i > columns[0], p1, g1, wp.max(i - 1, 0)) + pressed(i + 1 < end, p1, g1, wp.min(i + 1, end - 1))
+            value = (wp.float32(4.0) + shortest) * g1[i] - around
             z[env, row, i] = value
-            total += wp.float64(g[env, row, i] * value)
+            total += wp.float64(g1[i] * value)
+        i += 1
     sums[env, row] = wp.vec3d(total, _0, _0)
 
 
@@ -325,14 +334,18 @@ def turn(
     if row < rows[0] or row >= rows[1]:
         return
     if s.improved[env] != 0:
-        for i in range(columns[0], columns[1]):
+        i, end = wp.max(columns[0], 0), columns[1]
+        while i < end:
             best[env, row, i] = p[env, row, i]
+            i += 1
     if s.active[env] != 0:
-        for i in range(columns[0], columns[1]):
+        i, end = wp.max(columns[0], 0), columns[1]
+        while i < end:
             if p[env, row, i] > _ZERO:
                 t[env, row, i] = z[env, row, i] + s.beta[env] * t[env, row, i]
             else:
                 t[env, row, i] = _ZERO
+            i += 1
 
 
 @wp.kernel
@@ -348,10 +361,12 @@ def curvatures(
     if s.active[env] == 0 or row < rows[0] or row >= rows[1]:
         return
     rt, gt = wp.float64(0.0), wp.float64(0.0)
-    for i in range(columns[0], columns[1]):
+    i, end = wp.max(columns[0], 0), columns[1]
+    while i < end:
         if p[env, row, i] > _ZERO:
             rt += wp.float64(r[env, row, i] * t[env, row, i])
             gt += wp.float64(g[env, row, i] * t[env, row, i])
+        i += 1
     sums[env, row] = wp.vec3d(rt, gt, _0)
 
 
@@ -392,7 +407,8 @@ def move(
     if s.active[env] == 0 or row < rows[0] or row >= rows[1]:
         return
     tau, added = s.tau[env], wp.int32(0)
-    for i in range(columns[0], columns[1]):
+    i, end = wp.max(columns[0], 0), columns[1]
+    while i < end:
         value = wp.float32(0.0)
         if p[env, row, i] > _ZERO:
             value = wp.max(p[env, row, i] - tau * t[env, row, i], _ZERO)
@@ -400,6 +416,7 @@ def move(
             value = value - tau * shortest * g[env, row, i]
             added = wp.int32(1)
         p[env, row, i] = value
+        i += 1
     overlapping[env, row] = added
 
 
@@ -438,7 +455,8 @@ def convolve(
     last = nodes - 1
     for p in range(thread, out.shape[2], threads):
         a, b, c, d = out.dtype(), out.dtype(), out.dtype(), out.dtype()
-        for k in range(span[0], span[1]):
+        k, end = wp.max(span[0], 0), span[1]
+        while k < end:
             w = half[env, k, p]
             if k == 0 or k == last:
                 w = wp.float32(0.5) * w
@@ -448,6 +466,7 @@ def convolve(
             b += wp.cw_mul(table[wp.abs(i1 - k), p] + table[i1 + k, p], w)
             c += wp.cw_mul(table[wp.abs(i2 - k), p] + table[i2 + k, p], w)
             d += wp.cw_mul(table[wp.abs(i3 - k), p] + table[i3 + k, p], w)
+            k += 1
         out[env, i, p] = a
         out[env, i + 1, p] = b
         out[env, i + 2, p] = c
@@ -462,39 +481,53 @@ for _packet in PACKETS.values():
 
 @wp.kernel
 def lay(
-    is_laid: wp.int32, closed_gap: wp.float64, clearance: wp.array(dtype=wp.float64), near_y: wp.array(dtype=wp.int32),
-    near_x: wp.array(dtype=wp.int32), p: wp.array3d(dtype=wp.float32), rest: wp.array2d(dtype=wp.float64),
-    plain: wp.array3d(dtype=wp.float32), rise: wp.array3d(dtype=wp.float32), dent: wp.array3d(dtype=wp.float32),
-    under: wp.array3d(dtype=wp.float64),
+    s: Search, is_laid: wp.int32, closed_gap: wp.float64, clearance: wp.array(dtype=wp.float64),
+    near_y: wp.array(dtype=wp.int32), near_x: wp.array(dtype=wp.int32), p: wp.array3d(dtype=wp.float32),
+    rest: wp.array2d(dtype=wp.float64), plain: wp.array3d(dtype=wp.float32), rise: wp.array3d(dtype=wp.float32),
+    dent: wp.array3d(dtype=wp.float32), under: wp.array3d(dtype=wp.float64),
     # outputs
     height: wp.array3d(dtype=wp.float32),
     contact: wp.array3d(dtype=wp.uint8),
+    sound: wp.array(dtype=wp.int32),
 ):  # fmt: skip
     """Lay the coat on the object along a row of nodes.
 
     Overlaps are removed. Gaps under pressure are closed, g → g³/(1 + g²) with g = gap / ``closed_gap``. ``is_laid``: 0 shows the
-    ``plain`` height. Out of contact that is shown, too.
+    ``plain`` height. Out of contact that is shown, too. An environment with a height that is not finite is not ``sound``.
     """
     env, row = wp.tid()
     touched = wp.isfinite(clearance[env])
     at_rest, shown, marks, flat = rest[row], height[env, row], contact[env, row], plain[env, row]
     pressure, risen, dented, above = p[env, near_y[row]], rise[env, row], dent[env, row], under[env, row]
-    for i in range(height.shape[2]):
-        z, mark = at_rest[i] + wp.float64(flat[i]), wp.uint8(0)
-        if touched:
-            pressed = pressure[near_x[i]] > _ZERO
-            if is_laid != 0:
-                z = at_rest[i] + wp.float64(risen[i]) - wp.float64(dented[i])
-                gap = above[i] - z
-                if gap < _INF:
-                    if pressed:
-                        mark = wp.uint8(1)
-                    if gap < _0:
-                        z += gap
-                    elif pressed:
+    # Rows beside the window have no pressure.
+    bears = touched and near_y[row] >= s.rows[env][0] and near_y[row] < s.rows[env][1]
+    i, end, error = wp.int32(0), height.shape[2], wp.float32(0.0)
+    if touched and is_laid != 0:
+        while i < end:
+            z = at_rest[i] + wp.float64(risen[i]) - wp.float64(dented[i])
+            gap, mark = above[i] - z, wp.uint8(0)
+            if gap < _0:
+                z += gap
+            if bears:
+                if pressure[near_x[i]] > _ZERO and gap < _INF:
+                    mark = wp.uint8(1)
+                    if gap >= _0:
                         g = gap / closed_gap
                         z += closed_gap * g / (wp.float64(1.0) + g * g)
-            elif pressed:
-                mark = wp.uint8(1)
-        shown[i] = wp.float32(z)
-        marks[i] = mark
+            low = wp.float32(z)
+            error += low - low
+            shown[i] = low
+            marks[i] = mark
+            i += 1
+    else:
+        while i < end:
+            low, mark = wp.float32(at_rest[i] + wp.float64(flat[i])), wp.uint8(0)
+            if bears:
+                if pressure[near_x[i]] > _ZERO:
+                    mark = wp.uint8(1)
+            error += low - low
+            shown[i] = low
+            marks[i] = mark
+            i += 1
+    if wp.isnan(error):
+        sound[env] = 0

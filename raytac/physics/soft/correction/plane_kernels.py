@@ -116,10 +116,14 @@ def sort_waves(
     if row >= rows:
         k = 2 * (row - rows) + 1
     into, source, share = out[env, row], waves[env, k], factor[0, k]
-    for i in range(count):
+    i = wp.int32(0)
+    while i < count:
         into[i] = source[2 * i] * share[2 * i]
-    for i in range(waves.shape[2] - count):
+        i += 1
+    i, end = wp.int32(0), waves.shape[2] - count
+    while i < end:
         into[count + i] = source[2 * i + 1] * share[2 * i + 1]
+        i += 1
 
 
 @wp.kernel
@@ -139,11 +143,15 @@ def unfold(
     count, last = even.shape[2], out.shape[2] - 1
     upper, lower = out[env, j], out[env, out.shape[1] - 1 - j]
     a, b, c, d = even[env, j], odd_x[env, j], odd_y[env, j], odd[env, j]
-    for i in range(count):
+    i = wp.int32(0)
+    while i < count:
         near, far = a[i] + b[i], c[i] + d[i]
         upper[i] = near + far
         lower[i] = near - far
-    for i in range(count):
+        i += 1
+    i = wp.int32(0)
+    while i < count:
         near, far = a[i] - b[i], c[i] - d[i]
         upper[last - i] = near + far
         lower[last - i] = near - far
+        i += 1

@@ -99,9 +99,11 @@ def spread_waves(
     env, row = wp.tid()
     if active[env] == 0:
         return
-    for i in range(x.shape[2]):
+    i, end = wp.int32(0), x.shape[2]
+    while i < end:
         x[env, row, i] = spread_x[0, row, i] * waves[env, row, i]
         y[env, row, i] = spread_y[0, row, i] * waves[env, row, i]
+        i += 1
 
 
 @wp.kernel
