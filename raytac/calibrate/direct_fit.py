@@ -524,16 +524,28 @@ class DirectFit:
         """Motion (n, n) of all parameters by each that is ``free``.
 
         All move by their own change, and those ``stuck`` at a bound with it: what an LED reaches depends on its size and aim, and with that
-        the places where its middle may lie; those of virtual sources depend on the view too.
+        the places where its middle may lie; those of virtual sources depend on the view too. No LED depends on another, so that all move
+        at once in one column of ``LightParameters.leds`` after the other.
         """
         motion, circles = np.eye(len(x)), self.start.circles
         if not stuck.any():
             return motion
         beyond = x - 1e3 * STEP * np.sign(slope) * stuck
-        after = len(x) - len(self.start.slopes)
-        for k in (*np.flatnonzero(free[: self.start.p.leds.size]), *(after - 2 + np.flatnonzero(free[after - 2 : after]))):
-            ends = [self.flat(self.inside_bounds(self.at(beyond + sign * STEP * np.eye(len(x))[k], circles))) for sign in (1, -1)]
-            motion[stuck, k] = ((ends[0] - ends[1]) / (2 * STEP))[stuck]
+        after, (count, wide) = len(x) - len(self.start.slopes), self.start.p.leds.shape
+
+        def moved(chosen: np.ndarray) -> np.ndarray:
+            """Motion of all parameters by those that are ``chosen``, (n,)."""
+            ends = [self.flat(self.inside_bounds(self.at(beyond + sign * STEP * chosen, circles))) for sign in (1, -1)]
+            return (ends[0] - ends[1]) / (2 * STEP)
+
+        for column in range(wide):
+            chosen = free & (np.arange(len(x)) % wide == column) & (np.arange(len(x)) < count * wide)
+            by_column = moved(chosen) if chosen.any() else chosen
+            for k in np.flatnonzero(chosen):
+                own = slice(k - column, k - column + wide)
+                motion[own, k] = np.where(stuck[own], by_column[own], motion[own, k])
+        for k in after - 2 + np.flatnonzero(free[after - 2 : after]):
+            motion[stuck, k] = moved(np.arange(len(x)) == k)[stuck]
         return motion
 
     def solve(self, state: FitState, iterations: int, tick: Callable[[FitState, float], None] | None = None) -> FitState:

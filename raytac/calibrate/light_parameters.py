@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -109,12 +110,12 @@ class LightParameters:
         """The tone curve."""
         return ToneCurve(tuple(self.tone))
 
-    @property
+    @cached_property
     def layer(self) -> np.ndarray:
         """Index in ``CHANNELS`` of every LED's layer, (L,)."""
         return np.array([CHANNELS.index(led.layer) for led in self.template.leds])
 
-    @property
+    @cached_property
     def virtual(self) -> np.ndarray:
         """True for virtual sources, (L,)."""
         return np.array([led.virtual for led in self.template.leds])
