@@ -28,8 +28,8 @@ EXAMPLE = Path("examples", "own_optical_mode.py")
 OTHER_MODES = {"raytrace", "taxim", "phong", "mlp"}
 QUESTION = re.compile(r"(What|Whether|How|Where|Which|Who)\b")
 # "led" is not among them: the code models LEDs.
-WORDS = ("found", "way", "left", "borne", "held", "told", "anew")
-"""Words that stand for "result", "displacement", "residual", "carried", "constrained", "reported" and "again"."""
+WORDS = ("found", "way", "left", "borne", "held", "told", "anew", "askew")
+"""Words that stand for "result", "displacement", "residual", "carried", "constrained", "reported", "again" and "tilted"."""
 
 
 def modules(root: Path) -> dict[str, Path]:

@@ -7,13 +7,17 @@ The folder holds ``0.png`` (pressed), ``1.png`` (pressed and dragged), and ``0.c
 darkness; what is compared is the difference of both photographs.
 
 A model is told the circle of the contact in ``0.png``, an option, from which follows the depth, at which the edge of the rigid pad's
-imprint is as wide; and the ball's own motion, a displacement and a turn, by the dots within the circle. Nothing else is fitted, unless a
-constant: a displacement that is the same for all dots (a gel that slides in its case), by least squares, and taken off the ball's motion.
+imprint is as wide; and the ball's own motion: displacement and turn by the dots within the circle, or with ``--layers`` displacement and
+tilt by the rings of a printed ball's layers (``layer_motion``), and the turn alone by the dots. Nothing else is fitted, unless a constant:
+a displacement that is the same for all dots (a gel that slides in its case), by least squares, and taken off the ball's motion.
 
 - ``markers.dots``, ``.lost``, ``.size_um``: dots compared and lost, root mean square of their motion; ``.ball_um``, ``.turn_deg``.
 - ``markers.MODEL.under_um``, ``….outside_um``: root mean square distance of dots under the ball, and of the others.
-- ``markers.layers.…`` with ``--layers``: the ball's motion from the rings of its printed layers (``layer_motion``): of its lowest point
-  and its centre, roll, and the rings' correlation with and without a roll. No model is told these.
+- ``markers.layers.…`` with ``--layers``: displacement of the ball's lowest point and of its centre, its tilt, and the rings' correlation,
+  with the best motion, with the best that does not tilt, and by annulus.
+- ``markers.MODEL.constant.smooth_…_um``: what is left of that error when a smooth motion of all dots is fitted to it too, on one half of
+  the dots, and is taken off the other: a turn and a scale of the whole image, an affine and a quadratic motion. What a quadratic one
+  leaves is local: errors of dots, and of the model near the ball.
 - ``markers.MODEL.rms_um``, ``….share``: root mean square distance of model and photographs, and over ``size_um``; ``….along_um`` of its
   component along the ball's motion alone.
 - ``markers.MODEL.constant.…``: the same with a constant, ``….x_um`` and ``….y_um`` its value. ``residuals.png`` shows what remains.
@@ -28,7 +32,6 @@ of the dots, every other one, is tested on the other half, whose dots had no par
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,24 +39,21 @@ from typing import Annotated
 
 import numpy as np
 import tyro
-from scipy import ndimage
 
-from experiments.layer_motion import layer_motion
+from experiments.drag_photographs import BallMotion, Drag, layer_motion, rigid_motion
 from experiments.running import recorded, run
 from raytac.calibrate import PressedBall, pressed_balls
 from raytac.checks import check_number
 from raytac.device import resolve_device
 from raytac.errors import InputError, RaytacError
 from raytac.gel import PadGrid, rest_height
-from raytac.io import CommonOptions, parse_names, read_png
+from raytac.io import CommonOptions, parse_names
 from raytac.markers import MARKERS, ContactCells, ContactTracker, MarkersConfig, camera_of, height_at, markers_config
 from raytac.physics import PadReading, Rigid, RigidPad, SoftPad
 from raytac.specs import PADS, GelpadSpec, ObjectSpec, PressScene, SensorSpec, StageSpec, load_sensor
 
 PITCH = 0.1e-3
 """Spacing of the pad's nodes [m]."""
-REACH, DARK, LEAST = 9.0, (0.1, 0.9), 15.0
-"""Window of a dot's centroid [px]; darkness that counts not at all and wholly; least dark area of a dot [px]."""
 STEPS = 4
 """States of each of press and drag."""
 VARIED: dict[str, Callable[[GelpadSpec, str], GelpadSpec]] = {
@@ -87,91 +87,9 @@ class Args(CommonOptions):
     sensor: str = "gelsight_mini"
     """Sensor whose gelpad and marker motion are used."""
     layers: bool = False
-    """Also read the motion of a printed ball from the rings of its layers."""
+    """Read the motion of a printed ball from the rings of its layers, and tell it to the models."""
     vary: str = ""
     """Property of the gelpad and its values, as friction=0.3,0.5,1; see the module's text. None if empty."""
-
-
-@dataclass(frozen=True)
-class Drag:
-    """Dots of both photographs [px], (N, 2) each, and how many were lost."""
-
-    before: np.ndarray
-    after: np.ndarray
-    lost: int
-    size: tuple[int, int]
-    """Width and height of the photographs [px]."""
-    images: tuple[np.ndarray, ...] = ()
-    """Both photographs, (H, W, 3) each."""
-
-    @property
-    def motion(self) -> np.ndarray:
-        return self.after - self.before
-
-    @classmethod
-    def read(cls, folder: Path) -> Drag:
-        """Dots that both photographs show; raises ``InputError`` for missing, damaged or unlike files."""
-        try:
-            images = [read_png(folder / f"{k}.png") for k in (0, 1)]
-        except OSError as error:
-            raise InputError("data", value=str(folder), rule=f"must hold the photographs 0.png and 1.png: {error}") from error
-        near = [_places(folder / f"{k}.csv") for k in (0, 1)]
-        if images[0].shape != images[1].shape or near[0].shape != near[1].shape:
-            raise InputError(
-                "data", value=str(folder), rule="must hold two photographs of one size, with a row for each dot in both"
-            )
-        (before, area), (after, later) = (dot_centres(image, places) for image, places in zip(images, near, strict=True))
-        seen = (area >= LEAST) & (later >= LEAST)
-        if seen.sum() < 3:
-            raise InputError("data", value=str(folder), rule="must show at least three dots in both photographs")
-        height, width = images[0].shape[:2]
-        return cls(before[seen], after[seen], int((~seen).sum()), (width, height), tuple(images))
-
-
-def _places(path: Path) -> np.ndarray:
-    """About where the dots are [px], (N, 2)."""
-    try:
-        rows = list(csv.DictReader(path.read_text("utf-8").splitlines()))
-        start, motion = (
-            np.array([[float(row[name]) for name in names] for row in rows]) for names in (("Mx", "My"), ("dx", "dy"))
-        )
-    except (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
-        raise InputError("data", value=str(path), rule=f"must hold the columns Mx, My, dx, dy of numbers: {error}") from error
-    return (start + motion).reshape(-1, 2)
-
-
-def dot_centres(image: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centroids of dark dots [px], (N, 2), and their dark areas [px], (N,).
-
-    ``image`` (H, W, 3), ``near`` (N, 2): about where dots are [px]. Darkness is 1 less the brightest channel over what surrounds
-    the dot. The window of the centroid follows it until it stands still.
-    """
-    bright = image[..., :3].max(axis=2).astype(float)
-    behind = ndimage.gaussian_filter(ndimage.percentile_filter(bright, 80, size=int(3 * REACH)), 6.0)
-    dark = np.clip((1.0 - bright / np.maximum(behind, 1.0) - DARK[0]) / (DARK[1] - DARK[0]), 0.0, 1.0)
-    v, u = np.mgrid[: bright.shape[0], : bright.shape[1]] + 0.5
-    centres, areas = np.array(near, float), np.zeros(len(near))
-    for k, centre in enumerate(centres):
-        for _ in range(20):
-            weight = dark * (np.hypot(u - centre[0], v - centre[1]) < REACH)
-            areas[k] = weight.sum()
-            if areas[k] < LEAST:
-                break
-            moved = np.array([(weight * u).sum(), (weight * v).sum()]) / areas[k]
-            done, centre = np.abs(moved - centre).max() < 1e-3, moved
-            if done:
-                break
-        centres[k] = centre
-    return centres, areas
-
-
-def rigid_motion(places: np.ndarray, motion: np.ndarray, centre: np.ndarray) -> tuple[np.ndarray, float]:
-    """Displacement of ``centre`` and turn [rad] about it that fit the ``motion`` (N, 2) of ``places`` (N, 2) best, small turns."""
-    x, y = (places - centre).T
-    one, none = np.ones_like(x), np.zeros_like(x)
-    rows = np.concatenate([np.stack([one, none, -y], axis=1), np.stack([none, one, x], axis=1)])
-    u, v, turn = np.linalg.lstsq(rows, np.concatenate([motion[:, 0], motion[:, 1]]), rcond=None)[0]
-    return np.array([u, v]), float(turn)
 
 
 class Dragged:
@@ -189,27 +107,31 @@ class Dragged:
         self.scene = PressScene("ball", ball, (StageSpec("indent", depth=depth),))
         self._kept: dict[tuple[float, ...], tuple[PadGrid, list[PadReading]]] = {}
 
-    def readings(self, soft: bool, drag: np.ndarray, turn: float) -> tuple[PadGrid, list[PadReading]]:
-        """Grid and readings of the press and of the drag [m] with its turn [rad]; kept."""
-        key = float(soft), *map(float, drag), turn
+    def readings(self, soft: bool, own: BallMotion) -> tuple[PadGrid, list[PadReading]]:
+        """Grid and readings of the press and of the drag; kept."""
+        key = float(soft), *own.shear.tolist(), *own.tilt.tolist(), own.turn
         if key not in self._kept:
+            stages = *self.scene.trajectory, StageSpec("tilt", tilt=_pair(own.tilt))
+            scene = replace(self.scene, trajectory=stages)
             if soft:
-                pad = SoftPad(self.sensor, self.scene, pitch=PITCH, level=self.level, device=self.device)
+                pad = SoftPad(self.sensor, scene, pitch=PITCH, level=self.level, device=self.device)
             else:
-                pad = RigidPad(self.sensor, self.scene, pitch=PITCH)
+                pad = RigidPad(self.sensor, scene, pitch=PITCH)
             states = list(pad.follow(StageSpec("indent", depth=self.depth), steps=STEPS))
             for share in np.arange(1, STEPS + 1) / STEPS:
-                states += pad.follow(StageSpec("shear", shear=tuple((share * drag).tolist())))
-                if turn:
-                    states += pad.follow(StageSpec("twist", twist=float(share * turn)))
+                states += pad.follow(StageSpec("shear", shear=_pair(share * own.shear)))
+                if own.tilt.any():
+                    states += pad.follow(StageSpec("tilt", tilt=_pair(share * own.tilt)))
+                if own.turn:
+                    states += pad.follow(StageSpec("twist", twist=float(share * own.turn)))
             if any(state.failed.any() for state in states):
                 raise RaytacError("the drag did not converge")
             self._kept[key] = pad.grid, states
         return self._kept[key]
 
-    def motion(self, config: MarkersConfig, before: np.ndarray, drag: np.ndarray, turn: float) -> np.ndarray:
+    def motion(self, config: MarkersConfig, before: np.ndarray, own: BallMotion) -> np.ndarray:
         """Motion [px] of the dots that are at ``before`` [px] (N, 2) once the ball is pressed, (N, 2)."""
-        grid, readings = self.readings(config.needs_coat, drag, turn)
+        grid, readings = self.readings(config.needs_coat, own)
         model = config.build(self.sensor, grid, num_envs=1, device=self.device)
         cells = ContactCells.over(grid, config.contacts) if model.needs_contacts else None
         tracker, asked = ContactTracker(1, config.contacts, slip=config.slip(self.sensor)), []
@@ -240,18 +162,39 @@ def at_rest(sensor: SensorSpec, pixels: np.ndarray, seen: Callable[[np.ndarray],
 
 
 def compared(
-    drag: Drag, dragged: Dragged, config: MarkersConfig, own: tuple[np.ndarray, float], with_constant: bool
+    drag: Drag, dragged: Dragged, config: MarkersConfig, own: BallMotion, with_constant: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What photographs have over a model [px], (N, 2), and the constant [px], (2,); ``own``: motion of the ball [px], [rad]."""
+    """What photographs have over a model [px], (N, 2), and the constant [px], (2,); ``own``: motion of the ball."""
     pitch, constant = np.asarray(dragged.sensor.camera.pixel_pitch), np.zeros(2)
     for _ in range(4 if with_constant else 1):
-        difference = drag.motion - dragged.motion(config, drag.before, (own[0] - constant) * pitch, own[1])
+        moved = replace(own, shear=own.shear - constant * pitch)
+        difference = drag.motion - dragged.motion(config, drag.before, moved)
         if not with_constant:
             return difference, constant
         before, constant = constant, difference.mean(axis=0)
         if np.abs(constant - before).max() < 0.02:
             break
     return difference - constant, constant
+
+
+def smooth_parts(places: np.ndarray, difference: np.ndarray) -> dict[str, float]:
+    """RMS that smooth motions leave of a ``difference`` (N, 2) at ``places`` (N, 2), each half of the dots with the other's fit."""
+    x, y = ((places - places.mean(axis=0)) / np.ptp(places, axis=0).max()).T
+    one, none = np.ones_like(x), np.zeros_like(x)
+    rigid = [(one, none), (none, one), (-y, x), (x, y)]
+    powers = {"affine": (one, x, y), "quadratic": (one, x, y, x * x, x * y, y * y)}
+    motions = {"turn_and_scale": rigid} | {
+        name: [pair for term in terms for pair in ((term, none), (none, term))] for name, terms in powers.items()
+    }
+    result = {}
+    for name, pairs in motions.items():
+        rows, squares = np.array(pairs).transpose(2, 1, 0), 0.0  # (N, 2, number of motions)
+        for first in (0, 1):
+            fitted, tested = slice(first, None, 2), slice(1 - first, None, 2)
+            shares = np.linalg.lstsq(rows[fitted].reshape(-1, len(pairs)), difference[fitted].ravel(), rcond=None)[0]
+            squares += float(((difference[tested] - rows[tested] @ shares) ** 2).sum())
+        result[name] = float(np.sqrt(squares / len(places)))
+    return result
 
 
 def varied(gelpad: GelpadSpec, text: str) -> tuple[str, dict[str, GelpadSpec]]:
@@ -267,7 +210,7 @@ def varied(gelpad: GelpadSpec, text: str) -> tuple[str, dict[str, GelpadSpec]]:
 
 
 def chosen_by_halves(
-    drag: Drag, pads: dict[str, Dragged], model: str, name: str, own: tuple[np.ndarray, float], pitch_um: float
+    drag: Drag, pads: dict[str, Dragged], model: str, name: str, own: BallMotion, pitch_um: float
 ) -> dict[str, float | str]:
     """Metrics of pads by value: each half of the dots tested with the value and the constant that are best on the other."""
     print(f"| {model}: {name} | RMS [µm] | first half alone | second half alone |\n|---|---|---|---|", flush=True)
@@ -303,7 +246,14 @@ def main(args: Args) -> None:
     under = np.hypot(*(drag.before - circle[:2]).T) < UNDER * circle[2]
     if under.sum() < 2:
         raise InputError("circle_px", value=args.circle_px, rule="must have at least two dots inside")
-    own = rigid_motion(drag.before[under], drag.motion[under], circle[:2])
+    seen, turn = rigid_motion(drag.before[under], drag.motion[under], circle[:2])
+    own, layers = BallMotion(seen * np.asarray(sensor.camera.pixel_pitch), turn=turn), None
+    if args.layers:
+        assert ball.surface is not None
+        place = ball.surface.contact_centre[0]
+        centre = np.array([*place, radius - ball.depth + float(rest_height(sensor.gelpad, *place))])
+        layers = layer_motion(drag.images, sensor, circle, centre, radius)
+        own = replace(layers.motion, turn=turn)
     if args.vary:
         name, gelpads = varied(sensor.gelpad, args.vary)
         pads = {}
@@ -318,18 +268,18 @@ def main(args: Args) -> None:
     with recorded(args, "real_markers", device=device) as (folder, metrics):
         size = _rms(drag.motion) * pitch_um
         metrics |= {"markers.dots": len(drag.before), "markers.lost": drag.lost, "markers.size_um": size}
-        metrics |= {"markers.ball_um": float(np.hypot(*own[0])) * pitch_um, "markers.turn_deg": float(np.degrees(own[1]))}
+        metrics |= {"markers.ball_um": float(np.hypot(*seen)) * pitch_um, "markers.turn_deg": float(np.degrees(turn))}
         metrics |= {
             "markers.depth_mm": 1e3 * ball.depth,
             "markers.dots_under_ball": int(under.sum()),
             "markers.level": args.level,
         }
-        if args.layers:
-            figures = layer_motion(drag.images[0], drag.images[1], circle, args.ball_radius_mm / args.pitch_mm).figures(pitch_um)
+        if layers is not None:
+            figures = layers.figures(radius)
             metrics |= {f"markers.layers.{name}": value for name, value in figures.items()}
             print("layers: " + ", ".join(f"{name} {value:.4g}" for name, value in figures.items()), flush=True)
         residuals = {}
-        axis = own[0] / np.hypot(*own[0])
+        axis = seen / np.hypot(*seen)
         print(
             "| model | RMS [µm] | along the drag | share | with a constant: RMS [µm] | along the drag | share | constant [µm] |"
         )
@@ -345,6 +295,8 @@ def main(args: Args) -> None:
                 }
                 cells += [f"{rms:.1f}", f"{along:.1f}", f"{rms / size:.3f}"]
             metrics |= {f"{key}.{name_of}_um": float(c) * pitch_um for name_of, c in zip("xy", constant, strict=True)}
+            smooth = smooth_parts(drag.before, difference)
+            metrics |= {f"{key}.smooth_{part}_um": rms * pitch_um for part, rms in smooth.items()}
             residuals[name] = difference * pitch_um
             cells.append(", ".join(f"{c * pitch_um:.0f}" for c in constant))
             print(f"| {name} | {' | '.join(cells)} |", flush=True)
@@ -380,6 +332,10 @@ def photographed(sensor: SensorSpec, size: tuple[int, int], pitch: float) -> Sen
     """The sensor with a camera of photographs of ``size`` [px] whose pixels have ``pitch`` [m] on the gel."""
     camera = replace(sensor.camera, resolution=size, pixel_pitch=(pitch, pitch), principal_point=(size[0] / 2, size[1] / 2))
     return replace(sensor, camera=camera)
+
+
+def _pair(vector: np.ndarray) -> tuple[float, float]:
+    return float(vector[0]), float(vector[1])
 
 
 def _circle(text: str) -> np.ndarray:

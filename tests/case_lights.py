@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.abc
-import importlib.machinery
 import sys
-from types import ModuleType
 from typing import Any
+
+from tests.on_import import change_module
 
 MEASURED = (
     "calibrate/",
@@ -32,18 +31,6 @@ def limit(*, few: bool) -> None:
     module.SAMPLES = FEW if few else _full[0]
 
 
-class FewPaths(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Sets the number of paths when the module is imported, so that a script that renders nothing imports no renderer."""
-
-    def find_spec(self, fullname: str, path: Any, target: ModuleType | None = None) -> importlib.machinery.ModuleSpec | None:
-        spec = importlib.machinery.PathFinder.find_spec(fullname, path) if fullname == _MODULE else None
-        if spec is not None and spec.loader is not None:
-            self._loader, spec.loader = spec.loader, self
-        return spec
-
-    def create_module(self, spec: importlib.machinery.ModuleSpec) -> ModuleType | None:
-        return self._loader.create_module(spec)
-
-    def exec_module(self, module: ModuleType) -> None:
-        self._loader.exec_module(module)
-        module.__dict__["SAMPLES"] = FEW
+def always_few() -> None:
+    """Let all fits of this process take ``FEW`` paths."""
+    change_module(_MODULE, lambda module: setattr(module, "SAMPLES", FEW))

@@ -28,15 +28,18 @@ from raytac.specs.sensor import (
     ResponseSpec,
     SensorSpec,
 )
-from tests import case_lights, marks
+from tests import case_lights, coarse_figures, marks
 
 BALL_RADIUS = 4e-3
 BALL_DEPTH = 1e-3
+GARBAGE = 20_000, 10, 20
+"""Thresholds of searches for garbage: with Python's own, 700, they take 3 % of the suite."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
     gc.disable()  # a quarter of what collection takes, and it finds nothing: `pytest_collection_finish`
     marks.block(str(config.getoption("markexpr")))
+    coarse_figures.limit()
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -54,6 +57,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """Leave what stays for the whole session, some thousand tests and all modules, out of every later search for garbage."""
     gc.freeze()
+    gc.set_threshold(*GARBAGE)
     gc.enable()
 
 

@@ -59,7 +59,7 @@ def run_forked(*command: str, cwd: Path, env: Mapping[str, str] | None = None) -
     """Run ``python *command``: a script or ``-m MODULE``, and arguments.
 
     ``env`` is added to the environment, in which PYTHONPATH, if the caller has none, is this checkout. The case's light is fitted with few
-    paths, as in most tests. Raises RuntimeError if the process that is forked has ended.
+    paths and figures are saved with few dots, as in most tests. Raises RuntimeError if the process that is forked has ended.
     """
     with tempfile.TemporaryDirectory() as folder:
         files = [os.path.join(folder, name) for name in ("stdout", "stderr")]
@@ -133,9 +133,10 @@ def _become(request: dict[str, Any]) -> None:
     for name in _ENVIRONMENT - request["env"].keys():  # not of those that imports have set
         del os.environ[name]
     os.environ.update(request["env"])
-    from tests import case_lights
+    from tests import case_lights, coarse_figures
 
-    sys.meta_path.insert(0, case_lights.FewPaths())
+    coarse_figures.limit()
+    case_lights.always_few()
     first, *arguments = request["command"]
     if first == "-m":
         sys.argv = arguments

@@ -77,16 +77,6 @@ def test_files_of_a_toy_optical_mode(root: Path) -> None:
         house.measure(root)
 
 
-@pytest.mark.script
-def test_the_library_keeps_its_order() -> None:
-    """Bounds of the second plan; docstrings and words have tests of their own (``tests/test_words.py``)."""
-    counts, details = house.measure(Path(__file__).parents[1])
-    assert details["circles"] == []
-    assert details["mode_files"] == [str(house.EXAMPLE)]
-    assert counts["words"] <= 30, details["words"]
-    assert counts["single_importer_small_files"] <= 25, details["single_importer_small_files"]
-
-
 def test_it_writes_metrics_in_the_common_format(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = root / "out"
     monkeypatch.setattr(sys, "argv", ["house.py", "--root", str(root), "--out", str(out)])

@@ -25,7 +25,10 @@ wp.set_module_options({"enable_backward": False})
 DRIFT = 0.5
 """Displacement of a vertex over d̂ from which distances are measured anew."""
 AWAY = wp.constant(wp.float64(5.0))
-"""Distance over d̂ down to which a lower bound stands for a candidate's distance, for as long as its list is valid."""
+"""Distance over d̂ down to which a lower bound stands for a candidate's distance.
+
+Until there is a new list.
+"""
 NEAR = 2.5
 """Distance over d̂ of the candidates that are listed on a CPU.
 
@@ -74,7 +77,10 @@ def set_reference(x: VecArray2d, dx: VecArray2d, far: IntArray, reference: VecAr
 def measure_pairs(
     x: VecArray2d, surface: Surface, ee: wp.bool, far: IntArray, stale: IntArray, threads: wp.int32, candidates: Candidates
 ):
-    """Distances of the candidates at x, or what ``moved`` leaves of the last ones, by (environment, thread)."""
+    """Distances of the candidates at x, or what ``moved`` leaves of the last ones.
+
+    By (environment, thread).
+    """
     env, first = wp.tid()
     if far[env] == 0:
         return

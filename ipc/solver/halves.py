@@ -214,7 +214,10 @@ def add_open_row(
     return sum;
 """)
 def multiply_upper(system: SystemView, env: wp.int32, p: Vec4Array2d, out: Vec4Array2d) -> wp.float64:
-    """out = (blocks + volume rows) p on the unknowns, else 0, after :func:`fold_rows`; returns p·out."""
+    """out = (blocks + volume rows) p on the unknowns, else 0; returns p·out.
+
+    After :func:`fold_rows`.
+    """
     ...
 
 

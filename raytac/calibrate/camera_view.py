@@ -35,8 +35,11 @@ def _half_view(camera: CameraSpec) -> float:
 
 def view_of(sensor: SensorSpec) -> np.ndarray:
     """View of a sensor's camera, (2,)."""
-    camera = sensor.camera
-    return np.array([-1e3 * camera.position[2], camera.distortion[0] * _half_view(camera) ** 2])
+    return np.array(_view(sensor.camera))
+
+
+def _view(camera: CameraSpec) -> tuple[float, float]:
+    return -1e3 * camera.position[2], camera.distortion[0] * _half_view(camera) ** 2
 
 
 def with_view(sensor: SensorSpec, view: np.ndarray) -> SensorSpec:
@@ -44,14 +47,20 @@ def with_view(sensor: SensorSpec, view: np.ndarray) -> SensorSpec:
 
     The sensor itself where that is its view, so that a camera which was not fitted keeps its numbers to the last digit.
     """
-    own = view_of(sensor)
-    if np.array_equal(view, own):
-        return sensor
-    camera, (distance, distortion) = sensor.camera, map(float, view)
+    camera = camera_with_view(sensor.camera, *map(float, view))
+    return sensor if camera is sensor.camera else dataclasses.replace(sensor, camera=camera)
+
+
+@lru_cache(1024)
+def camera_with_view(camera: CameraSpec, distance: float, distortion: float) -> CameraSpec:
+    """The camera of ``with_view``; that which is given if it has this view."""
+    own = _view(camera)
+    if (distance, distortion) == own:
+        return camera
     z = camera.position[2] if distance == own[0] else -1e-3 * distance
     moved = dataclasses.replace(camera, position=(*camera.position[:2], z))
     k1 = distortion / _half_view(moved) ** 2
-    return dataclasses.replace(sensor, camera=dataclasses.replace(moved, distortion=(k1, *camera.distortion[1:])))
+    return dataclasses.replace(moved, distortion=(k1, *camera.distortion[1:]))
 
 
 def most_distorted(sensor: SensorSpec, distance: float) -> float:

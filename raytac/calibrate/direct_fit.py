@@ -15,12 +15,13 @@ import copy
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from raytac.calibrate.camera_view import ViewBounds, check_view, with_view
-from raytac.calibrate.direct_light import ExtraLight, LedLight, Light, case_light, led_light
-from raytac.calibrate.imprint import PixelGeometry, pixel_geometry
+from raytac.calibrate.direct_light import ExtraLight, LedLight, Light, case_light, led_light, led_slopes
+from raytac.calibrate.imprint import PixelGeometry, circles_on_pad, on_plane, pixel_geometry, rest_geometry
 from raytac.calibrate.light_parameters import (
     DARKEST,
     HEIGHT,
@@ -117,6 +118,19 @@ class FitState:
     circles: np.ndarray
 
 
+@dataclass(frozen=True)
+class _Seen:
+    """Sensor with a view, and its geometry whatever is pressed."""
+
+    sensor: SensorSpec
+    places: tuple[np.ndarray, np.ndarray]
+    """Places on z = 0 that pixels of presses see."""
+    flat: PixelGeometry
+    """Coat at rest in these pixels."""
+    rest: PixelGeometry
+    """Coat over the image at rest."""
+
+
 class DirectFit:
     """Least-squares problem on the pixels near the circles of ``shots``, the circles' prior."""
 
@@ -169,6 +183,10 @@ class DirectFit:
         self.ties = side_ties(start.p, len(self.flat(start)))
         self.anchor, self.hold = self.flat(start), 0.0
         self.views = ViewBounds(sensor, start.p.view)
+        self.sigma = self._sigma()
+        """Standard deviation of every parameter about its start, (n,)."""
+        # A view's pixels are asked for by every derivative at it, and its circles by all but their own.
+        self._seen, self._on_pad = lru_cache(8)(self._seen), lru_cache(8)(self._on_pad)
 
     def with_points(self, points: tuple[EdgePoints, ...]) -> DirectFit:
         """The same problem with ``points`` on its LEDs.
@@ -200,38 +218,44 @@ class DirectFit:
         other.anchor, other.hold = self.flat(state), hold
         return other
 
-    def _held(self, state: FitState) -> np.ndarray:
+    def _held(self) -> np.ndarray:
         """Stiffness of every parameter to the anchor, (n,): that of LEDs' rows."""
         stiff = np.zeros(len(self.anchor))
-        stiff[: state.p.leds.size] = self.hold
-        return stiff / self.sigma(state.p) ** 2
+        stiff[: self.start.p.leds.size] = self.hold
+        return stiff / self.sigma**2
 
-    def _geometry(self, state: FitState, u: np.ndarray, v: np.ndarray, press: np.ndarray) -> PixelGeometry:
-        own = with_view(self.sensor, state.p.view)
-        return pixel_geometry(own, u, v, press, state.circles, self.shots.radius, state.slopes)
+    def _seen(self, view: tuple[float, ...]) -> _Seen:
+        own = with_view(self.sensor, np.array(view))
+        places, rest = on_plane(own.camera, self.u, self.v), on_plane(own.camera, self.rest_u, self.rest_v)
+        return _Seen(own, places, rest_geometry(own, places), rest_geometry(own, rest))
+
+    def _on_pad(self, view: tuple[float, ...], circles: bytes) -> np.ndarray:
+        return circles_on_pad(self._seen(view).sensor, np.frombuffer(circles).reshape(-1, 3), self.shots.radius)
 
     def geometry(self, state: FitState) -> PixelGeometry:
         """Points and normals that the pixels of presses see."""
-        return self._geometry(state, self.u, self.v, self.press)
+        view = tuple(map(float, state.p.view))
+        seen, on_pad = self._seen(view), self._on_pad(view, state.circles.astype(float).tobytes())
+        return pixel_geometry(seen.sensor, seen.places, self.press, on_pad, self.shots.radius, state.slopes)
 
     def geometries(self, state: FitState) -> tuple[PixelGeometry, PixelGeometry, PixelGeometry]:
         """Points and normals in pixels of presses, the same at rest, and over the image at rest."""
-        places = (self.u, self.v, self.press), (self.u, self.v, np.full(len(self.u), -1))
-        at_rest = self.rest_u, self.rest_v, np.full(len(self.rest_u), -1)
-        seen, flat, rest = (self._geometry(state, *where) for where in (*places, at_rest))
-        return seen, flat, rest
+        seen = self._seen(tuple(map(float, state.p.view)))
+        return self.geometry(state), seen.flat, seen.rest
 
     def light(self, state: FitState) -> Light:
         """Direct light of every LED at power 1."""
-        return Light(*(self._led_layers(state.p, g, self._leds(state.p, g)) for g in self.geometries(state)))
+        p = state.p
+        return Light(*(self._led_layers(p, g, [led_light(g, *led) for led in self._leds(p)]) for g in self.geometries(state)))
 
-    def _leds(self, p: LightParameters, seen: PixelGeometry) -> list[LedLight]:
-        return [led_light(seen, led, points, REFERENCE_DISTANCE) for led, points in zip(p.leds, self.points, strict=True)]
+    def _leds(self, p: LightParameters) -> list[tuple[np.ndarray, EdgePoints, float]]:
+        """Of every LED what its light depends on beside the geometry."""
+        return [(led, points, REFERENCE_DISTANCE) for led, points in zip(p.leds, self.points, strict=True)]
 
-    def _led_layers(self, p: LightParameters, seen: PixelGeometry, leds: list[LedLight]) -> np.ndarray:
-        """(L, M, 3): direct light of every LED and the even glow that goes with it."""
+    def _led_layers(self, p: LightParameters, seen: PixelGeometry, leds: list[np.ndarray]) -> np.ndarray:
+        """(L, M, 3): direct light of every LED, (M,) each, and the even glow that goes with it."""
         even = case_light(seen)[:, None] * self.even_gain
-        return np.stack([led.light[:, None] + p.glow[k] * even for led, k in zip(leds, p.layer, strict=True)])
+        return np.stack([light[:, None] + p.glow[k] * even for light, k in zip(leds, p.layer, strict=True)])
 
     def total(self, p: LightParameters, light: Light) -> list[np.ndarray]:
         """Linear light (M, 3) in the pixels of presses, in the same at rest, over the image at rest."""
@@ -265,9 +289,9 @@ class DirectFit:
         view = [("distance", 1), ("distortion", 1)]
         return [*per_led, ("power", p.power.size), *rest, *view, ("slope", len(self.start.slopes))]
 
-    def sigma(self, p: LightParameters) -> np.ndarray:
-        """Standard deviation of every parameter about its start, (n,)."""
-        unit = {"power": mean_power(self.start.p), "distance": self.start.p.view[0]}
+    def _sigma(self) -> np.ndarray:
+        p = self.start.p
+        unit = {"power": mean_power(p), "distance": p.view[0]}
         return np.concatenate([np.full(n, SIGMA[name] * unit.get(name, 1.0)) for name, n in self.blocks(p)])
 
     def free(self, p: LightParameters) -> np.ndarray:
@@ -341,14 +365,14 @@ class DirectFit:
     def cost(self, state: FitState, off: tuple[np.ndarray, np.ndarray]) -> float:
         h = self.settings.huber
         robust = [np.where(np.abs(r) <= h, r * r, h * (2 * np.abs(r) - h)) for r in (off[0], off[1][0])]
-        x = (self.flat(state) - self.flat(self.start)) / self.sigma(state.p)
+        x = (self.flat(state) - self.flat(self.start)) / self.sigma
         c, tied = (state.circles - self.shots.circles) / self.circle_sigma, self.ties.off(self.flat(state))
         images = (robust[0] * self.share**2).sum() + (robust[1] * self.rest_share**2).sum()
         images += ((off[1][1] * self.lack_share) ** 2).sum()
         away = self.flat(state) - self.anchor
         priors = (
             self.settings.prior * (x @ x)
-            + self._held(state) @ away**2
+            + self._held() @ away**2
             + self.settings.ties * (tied @ tied)
             + CIRCLE_PRIOR * (c * c).sum()
         )
@@ -357,8 +381,9 @@ class DirectFit:
     def jacobian(self, state: FitState) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Jacobians of ``residuals`` (3M, G) and (6K, G), of presses by circles (3M, 3); residuals."""
         p, geometries = state.p, self.geometries(state)
-        leds = [self._leds(p, g) for g in geometries]
-        whole = self._with_extra(p, Light(*(self._led_layers(p, g, part) for g, part in zip(geometries, leds, strict=True))))
+        leds = [[led_slopes(g, *led) for led in self._leds(p)] for g in geometries]
+        layers = (self._led_layers(p, g, [led.light for led in part]) for g, part in zip(geometries, leds, strict=True))
+        whole = self._with_extra(p, Light(*layers))
         total = _summed(p, whole)
         off, rest_off = self._residuals(p, total)
         gains = self._gains(p, total)
@@ -444,12 +469,12 @@ class DirectFit:
         seen = self.weights(rest_off[0], settings.huber) * self.rest_share**2
         rest_w = np.stack([seen, np.full_like(seen, self.lack_share**2)]).ravel().astype(np.float32)
         free = self.free(state.p)
-        x, x0, sigma = self.flat(state), self.flat(self.start), self.sigma(state.p)
+        x, x0, sigma = self.flat(state), self.flat(self.start), self.sigma
         size = len(x)
         n = size + 3 * count
         normal, slope = np.zeros((n, n)), np.zeros(n)
         normal[:size, :size] = (jac.T * w) @ jac + (rest_jac.T * rest_w) @ rest_jac
-        held = self._held(state)
+        held = self._held()
         normal[:size, :size] += np.diag(settings.prior / sigma**2 + held) + settings.ties * self.ties.matrix.T @ self.ties.matrix
         slope[:size] = (jac.T * w) @ off.ravel() + (rest_jac.T * rest_w) @ rest_off.ravel()
         slope[:size] += (
@@ -499,16 +524,28 @@ class DirectFit:
         """Motion (n, n) of all parameters by each that is ``free``.
 
         All move by their own change, and those ``stuck`` at a bound with it: what an LED reaches depends on its size and aim, and with that
-        the places where its middle may lie; those of virtual sources depend on the view too.
+        the places where its middle may lie; those of virtual sources depend on the view too. No LED depends on another, so that all move
+        at once in one column of ``LightParameters.leds`` after the other.
         """
         motion, circles = np.eye(len(x)), self.start.circles
         if not stuck.any():
             return motion
         beyond = x - 1e3 * STEP * np.sign(slope) * stuck
-        after = len(x) - len(self.start.slopes)
-        for k in (*np.flatnonzero(free[: self.start.p.leds.size]), *(after - 2 + np.flatnonzero(free[after - 2 : after]))):
-            ends = [self.flat(self.inside_bounds(self.at(beyond + sign * STEP * np.eye(len(x))[k], circles))) for sign in (1, -1)]
-            motion[stuck, k] = ((ends[0] - ends[1]) / (2 * STEP))[stuck]
+        after, (count, wide) = len(x) - len(self.start.slopes), self.start.p.leds.shape
+
+        def moved(chosen: np.ndarray) -> np.ndarray:
+            """Motion of all parameters by those that are ``chosen``, (n,)."""
+            ends = [self.flat(self.inside_bounds(self.at(beyond + sign * STEP * chosen, circles))) for sign in (1, -1)]
+            return (ends[0] - ends[1]) / (2 * STEP)
+
+        for column in range(wide):
+            chosen = free & (np.arange(len(x)) % wide == column) & (np.arange(len(x)) < count * wide)
+            by_column = moved(chosen) if chosen.any() else chosen
+            for k in np.flatnonzero(chosen):
+                own = slice(k - column, k - column + wide)
+                motion[own, k] = np.where(stuck[own], by_column[own], motion[own, k])
+        for k in after - 2 + np.flatnonzero(free[after - 2 : after]):
+            motion[stuck, k] = moved(np.arange(len(x)) == k)[stuck]
         return motion
 
     def solve(self, state: FitState, iterations: int, tick: Callable[[FitState, float], None] | None = None) -> FitState:

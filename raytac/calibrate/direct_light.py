@@ -16,8 +16,9 @@ Derivatives are those of this sum, with all that the points move by.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -63,118 +64,166 @@ class _Frame:
 
 
 @dataclass(frozen=True)
-class _PointLight:
-    """Light of one point of an LED, its slopes by the point, the aim's two angles and the lobe."""
+class _PointSlopes:
+    """Slopes of a point's light by its place, the aim's two angles, the lobe and the normal."""
 
-    light: np.ndarray
     by_place: np.ndarray
     by_aim: np.ndarray
     by_lobe: np.ndarray
     by_normal: np.ndarray
 
 
-def _point_light(seen: PixelGeometry, d: np.ndarray, frame: _Frame, lobe: float, reference: float) -> _PointLight:
-    """Light of a point at ``d`` (3, M) [m] from the points ``seen``."""
-    inverse = 1 / np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-    w = d * inverse
-    towards = -(frame.axis @ w)
-    c = np.maximum(towards, _BEHIND)
-    by_cosine, by_lobe = lobe_slopes(towards, lobe, _BEHIND)
-    cosine = w[0] * seen.n[0] + w[1] * seen.n[1] + w[2] * seen.n[2]
-    root = np.sqrt(cosine * cosine + _SOFT**2)
-    soft = 0.5 * (cosine + root)
-    arriving = lobe_gain(np, towards, lobe, _BEHIND) * (reference * inverse) ** 2
-    light = arriving * soft
-    slope = arriving * (0.5 * (1 + cosine / root))
-    steep = by_cosine * light
-    # ∂c/∂l = −(a + c w) / r, ∂cos/∂l = (n_p − cos w) / r, ∂r⁻²/∂l = −2 w r⁻³.
-    along = steep * c + slope * cosine + 2 * light
-    by_place = inverse * (slope * seen.n - steep * frame.axis[:, None] - along * w)
-    by_aim = -steep * (frame.axis_slopes @ w)
-    return _PointLight(light, by_place, by_aim, light * by_lobe, slope * w)
+class _PointLight:
+    """Light of a point of an LED at ``d`` (3, M) [m] from the points ``seen``."""
+
+    def __init__(self, seen: PixelGeometry, d: np.ndarray, frame: _Frame, lobe: float, reference: float) -> None:
+        self.seen, self.frame, self.lobe = seen, frame, lobe
+        self.inverse = 1 / np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+        self.w = w = d * self.inverse
+        self.towards = -(frame.axis @ w)
+        self.cosine = w[0] * seen.n[0] + w[1] * seen.n[1] + w[2] * seen.n[2]
+        self.root = np.sqrt(self.cosine * self.cosine + _SOFT**2)
+        self.arriving = lobe_gain(np, self.towards, lobe, _BEHIND) * (reference * self.inverse) ** 2
+        self.light = self.arriving * (0.5 * (self.cosine + self.root))
+
+    def slopes(self) -> _PointSlopes:
+        c, cosine, light, w = np.maximum(self.towards, _BEHIND), self.cosine, self.light, self.w
+        by_cosine, by_lobe = lobe_slopes(self.towards, self.lobe, _BEHIND)
+        slope = self.arriving * (0.5 * (1 + cosine / self.root))
+        steep = by_cosine * light
+        # ∂c/∂l = −(a + c w) / r, ∂cos/∂l = (n_p − cos w) / r, ∂r⁻²/∂l = −2 w r⁻³.
+        along = steep * c + slope * cosine + 2 * light
+        by_place = self.inverse * (slope * self.seen.n - steep * self.frame.axis[:, None] - along * w)
+        by_aim = -steep * (self.frame.axis_slopes @ w)
+        return _PointSlopes(by_place, by_aim, light * by_lobe, slope * w)
 
 
 @dataclass(frozen=True)
 class _Place:
-    """Place x [m] on the longer edge, its density, and the slopes of x and log density.
-
-    Slopes are by the foot F, the distance R and half the edge's length h, three arrays (M,) each.
-    """
+    """Place x [m] on the longer edge and its density."""
 
     x: np.ndarray
     density: np.ndarray
-    x_slopes: tuple[np.ndarray, ...]
-    log_slopes: tuple[np.ndarray, ...]
+    share: float
+    tangent: np.ndarray
 
 
-def _places(foot: np.ndarray, distance: np.ndarray, half: float, count: int) -> list[_Place]:
-    """Places of ``count`` points on the longer edge; one is its middle."""
-    if count == 1:
-        none = np.zeros_like(foot)
-        return [_Place(none, none + 1, (none,) * 3, (none,) * 3)]
-    ends, slopes = [], []
-    for sign in (-1, 1):
-        end = foot + sign * half
-        square = distance**2 + end**2
-        ends.append(np.arctan2(end, distance))
-        slopes.append((distance / square, -end / square, sign * distance / square))
-    span, span_slopes = ends[1] - ends[0], [b - a for a, b in zip(*slopes, strict=True)]
-    places = []
-    for share, weight in gauss(count):
-        angle = ends[0] + share * span
-        turned = [a + share * s for a, s in zip(slopes[0], span_slopes, strict=True)]
-        tangent = np.tan(angle)
+class _Edge:
+    """Longer edge of an LED, seen from M points: foot F, distance R (M,), half length h [m]."""
+
+    def __init__(self, foot: np.ndarray, distance: np.ndarray, half: float, count: int) -> None:
+        self.foot, self.distance, self.half, self.count = foot, distance, half, count
+        self.ends = [foot + sign * half for sign in (-1, 1)]
+
+    @cached_property
+    def span(self) -> np.ndarray:
+        """Angle that the edge spans, (M,)."""
+        low, high = self._angles
+        return high - low
+
+    @cached_property
+    def _angles(self) -> list[np.ndarray]:
+        return [np.arctan2(end, self.distance) for end in self.ends]
+
+    def places(self) -> list[_Place]:
+        """Places of the edge's points; one is its middle."""
+        if self.count == 1:
+            none = np.zeros_like(self.foot)
+            return [_Place(none, none + 1, 0.5, none)]
+        places = []
+        for share, weight in gauss(self.count):
+            tangent = np.tan(self._angles[0] + share * self.span)
+            density = weight * 0.5 * self.span * self.distance * (1 + tangent * tangent) / self.half
+            places.append(_Place(self.distance * tangent - self.foot, density, share, tangent))
+        return places
+
+    @cached_property
+    def _end_slopes(self) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+        """Slopes of the first end's angle and of the span by F, R and h."""
+        slopes = []
+        for sign, end in zip((-1, 1), self.ends, strict=True):
+            square = self.distance**2 + end**2
+            slopes.append((self.distance / square, -end / square, sign * self.distance / square))
+        return slopes[0], tuple(b - a for a, b in zip(*slopes, strict=True))
+
+    def slopes(self, place: _Place) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+        """Slopes of x and of the density's logarithm by F, R and h, three (M,) each."""
+        if self.count == 1:
+            none = np.zeros_like(self.foot)
+            return (none,) * 3, (none,) * 3
+        first, span_slopes = self._end_slopes
+        turned = [a + place.share * s for a, s in zip(first, span_slopes, strict=True)]
+        tangent = place.tangent
         secant = 1 + tangent * tangent
         own_x = (-1.0, tangent, 0.0)
-        own_log = (0.0, 1 / distance, -1 / half)
-        places.append(
-            _Place(
-                distance * tangent - foot,
-                weight * 0.5 * span * distance * secant / half,
-                tuple(distance * secant * t + o for t, o in zip(turned, own_x, strict=True)),
-                tuple(s / span + 2 * tangent * t + o for s, t, o in zip(span_slopes, turned, own_log, strict=True)),
-            )
+        own_log = (0.0, 1 / self.distance, -1 / self.half)
+        return (
+            tuple(self.distance * secant * t + o for t, o in zip(turned, own_x, strict=True)),
+            tuple(s / self.span + 2 * tangent * t + o for s, t, o in zip(span_slopes, turned, own_log, strict=True)),
         )
-    return places
 
 
-def led_light(seen: PixelGeometry, led: np.ndarray, points: EdgePoints, reference: float) -> LedLight:
-    """``led``: row of ``LightParameters.leds``; ``reference`` [m]: d₀."""
-    frame, lobe = _Frame.of(*led[3:5]), led[5]
-    long, short = (1, 0) if points.upright else (0, 1)
-    halves = 0.5e-3 * led[7], 0.5e-3 * led[6]
-    (e, f), (half, other) = (frame.edges[long], frame.edges[short]), (halves[long], halves[short])
-    q = 1e-3 * led[:3, None] - seen.p
+class _Face:
+    """Emitting face of an LED, a row of ``LightParameters.leds``, seen from M points."""
+
+    def __init__(self, seen: PixelGeometry, led: np.ndarray, points: EdgePoints, reference: float) -> None:
+        self.seen, self.lobe, self.reference, self.across = seen, led[5], reference, points.across
+        self.frame = _Frame.of(*led[3:5])
+        self.long, self.short = (1, 0) if points.upright else (0, 1)
+        halves = 0.5e-3 * led[7], 0.5e-3 * led[6]
+        self.e, self.f, self.other = self.frame.edges[self.long], self.frame.edges[self.short], halves[self.short]
+        self.q = 1e-3 * led[:3, None] - seen.p
+        foot = self.e @ self.q
+        distance = np.sqrt(np.maximum(np.einsum("km,km->m", self.q, self.q) - foot * foot, 1e-12))
+        self.edge = _Edge(foot, distance, halves[self.long], points.along)
+
+    def points(self) -> Iterator[tuple[_Place, float, float, _PointLight]]:
+        """Of every point: places on the longer edge and, in [−1, 1], the other; weight; light."""
+        for place in self.edge.places():
+            for share, weight in gauss(self.across):
+                y = 2 * share - 1
+                d = self.q + self.e[:, None] * place.x + (self.f * (y * self.other))[:, None]
+                yield place, y, weight, _PointLight(self.seen, d, self.frame, self.lobe, self.reference)
+
+
+def led_light(seen: PixelGeometry, led: np.ndarray, points: EdgePoints, reference: float) -> np.ndarray:
+    """D, (M,); ``led``: row of ``LightParameters.leds``; ``reference`` [m]: d₀."""
+    light = np.zeros(len(seen.p[0]))
+    for place, _, weight, one in _Face(seen, led, points, reference).points():
+        light += weight * place.density * one.light
+    return light
+
+
+def led_slopes(seen: PixelGeometry, led: np.ndarray, points: EdgePoints, reference: float) -> LedLight:
+    """``led_light`` with its slopes, for several times the work."""
+    face = _Face(seen, led, points, reference)
+    e, q, edge, long, short = face.e, face.q, face.edge, face.long, face.short
     light, by_lobe, by_other, by_foot, by_distance, by_half = np.zeros((6, len(seen.p[0])))
     by_place, by_e, by_f = np.zeros((3, *q.shape))
     by_normal = np.zeros(q.shape)
     by_aim = np.zeros((2, len(light)))
-    foot = e @ q
-    distance = np.sqrt(np.maximum(np.einsum("km,km->m", q, q) - foot * foot, 1e-12))
-    for place in _places(foot, distance, half, points.along):
-        for share, weight in gauss(points.across):
-            y = (2 * share - 1) * other
-            one = _point_light(seen, q + e[:, None] * place.x + (f * y)[:, None], frame, lobe, reference)
-            density = weight * place.density
-            along = e @ one.by_place
-            light += density * one.light
-            by_place += density * one.by_place
-            by_aim += density * one.by_aim
-            by_lobe += density * one.by_lobe
-            by_normal += density * one.by_normal
-            by_e += density * place.x * one.by_place
-            by_f += density * y * one.by_place
-            by_other += density * (2 * share - 1) * (f @ one.by_place)
-            by_foot += density * (along * place.x_slopes[0] + one.light * place.log_slopes[0])
-            by_distance += density * (along * place.x_slopes[1] + one.light * place.log_slopes[1])
-            by_half += density * (along * place.x_slopes[2] + one.light * place.log_slopes[2])
+    for place, y, weight, one in face.points():
+        slopes, density = one.slopes(), weight * place.density
+        x_slopes, log_slopes = edge.slopes(place)
+        along = e @ slopes.by_place
+        light += density * one.light
+        by_place += density * slopes.by_place
+        by_aim += density * slopes.by_aim
+        by_lobe += density * slopes.by_lobe
+        by_normal += density * slopes.by_normal
+        by_e += density * place.x * slopes.by_place
+        by_f += density * (y * face.other) * slopes.by_place
+        by_other += density * y * (face.f @ slopes.by_place)
+        by_foot += density * (along * x_slopes[0] + one.light * log_slopes[0])
+        by_distance += density * (along * x_slopes[1] + one.light * log_slopes[1])
+        by_half += density * (along * x_slopes[2] + one.light * log_slopes[2])
     # F = e · q and R² = q² − F².
-    by_line = by_distance / distance
-    rise = by_foot - by_line * foot
+    by_line = by_distance / edge.distance
+    rise = by_foot - by_line * edge.foot
     by_led = np.empty((8, len(light)))
     by_led[:3] = 1e-3 * (by_place + rise * e[:, None] + by_line * q)
     for k in (0, 1):
-        turned_e, turned_f = frame.edge_slopes[long][k], frame.edge_slopes[short][k]
+        turned_e, turned_f = face.frame.edge_slopes[long][k], face.frame.edge_slopes[short][k]
         by_led[3 + k] = by_aim[k] + turned_e @ by_e + turned_f @ by_f + rise * (turned_e @ q)
     by_led[5] = by_lobe
     by_led[7 - long], by_led[7 - short] = 0.5e-3 * by_half, 0.5e-3 * by_other

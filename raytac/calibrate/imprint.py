@@ -28,6 +28,8 @@ They are about the rigid pad's at the depth where its contact is as wide as the 
 WIDEST = 0.95
 """Largest sine of a slope."""
 _TABLE = np.linspace(0, KNOTS[-1], 751)
+_STEPS = 6
+"""Iterations of where a ray meets the coat."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +54,8 @@ def _heights(slopes: np.ndarray, share: np.ndarray) -> np.ndarray:
     return total[:, -1:] - total
 
 
-def _on_plane(camera: CameraSpec, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """x and y [m], from the pinhole's, where pixels see the plane z = 0."""
+def on_plane(camera: CameraSpec, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x and y [m], from the pinhole's, where pixels of the sensor's resolution see z = 0."""
     (cx, cy), (fx, fy) = camera.principal_point, camera.focal
     tx, ty = camera.lens.slope((u - cx) / fx, (v - cy) / fy)
     return -camera.position[2] * tx, -camera.position[2] * ty
@@ -61,7 +63,7 @@ def _on_plane(camera: CameraSpec, u: np.ndarray, v: np.ndarray) -> tuple[np.ndar
 
 def _pitch(camera: CameraSpec, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Side [m] of a square on the plane z = 0 as large as what a pixel shows of it."""
-    ends = [_on_plane(camera, u + 0.5 * du, v + 0.5 * dv) for du, dv in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    ends = [on_plane(camera, u + 0.5 * du, v + 0.5 * dv) for du, dv in ((1, 0), (-1, 0), (0, 1), (0, -1))]
     (a, b), (c, d) = ([e - f for e, f in zip(ends[k], ends[k + 1], strict=True)] for k in (0, 2))
     return np.sqrt(a * d - b * c)
 
@@ -74,7 +76,7 @@ def circles_on_pad(sensor: SensorSpec, circles: np.ndarray, ball_radius: np.ndar
     camera = sensor.camera
     distance = -camera.position[2]
     u, v, r = np.asarray(circles, dtype=float).T
-    (flat_x, flat_y), flat_r = _on_plane(camera, u, v), r * _pitch(camera, u, v)
+    (flat_x, flat_y), flat_r = on_plane(camera, u, v), r * _pitch(camera, u, v)
     deep = 0.5 * flat_r**2 / ball_radius
     z = -deep
     x, y = z, z
@@ -98,42 +100,58 @@ def rims_on_pad(sensor: SensorSpec, circles: np.ndarray, ball_radius: np.ndarray
 
 def pixel_geometry(
     sensor: SensorSpec,
-    u: np.ndarray,
-    v: np.ndarray,
+    places: tuple[np.ndarray, np.ndarray],
     press: np.ndarray,
-    circles: np.ndarray,
+    on_pad: np.ndarray,
     ball_radius: np.ndarray,
     slopes: np.ndarray,
 ) -> PixelGeometry:
-    """Coat seen by the pixels ``u``, ``v`` (M,) of the presses ``press`` (M,).
+    """Coat seen by pixels of the presses ``press`` (M,).
 
-    Pixels are those of the sensor's resolution. ``circles`` (N, 3) [px], ``ball_radius`` (N,) [m]; ``slopes``: s at the inner
-    ``KNOTS``. Where ``press`` is −1 the pad is at rest. The ray is met by iterating its height; slopes of the view are below 0.4, so
-    that six steps leave less than a micrometre.
+    ``places``: where they see z = 0 (``on_plane``); ``on_pad`` (N, 3) [m]: ``circles_on_pad``, ``ball_radius`` (N,) [m]; ``slopes``: s
+    at the inner ``KNOTS``. The ray is met by iterating its height; slopes of the view are below 0.4, so that six steps leave less than a
+    micrometre.
     """
-    camera = sensor.camera
-    distance, (flat_x, flat_y) = -camera.position[2], _on_plane(camera, u, v)
-    pressed = press >= 0
-    on_pad = circles_on_pad(sensor, circles, ball_radius) if len(circles) else np.array([[0.0, 0.0, 1.0]])
-    share = on_pad[:, 2] / ball_radius if len(circles) else np.zeros(1)
-    heights, own = _heights(slopes, share), np.where(pressed, press, 0)
-    at, a, a_share = on_pad[own, :2], on_pad[own, 2], share[own]
-    z = np.zeros(len(u))
-    x, y, dx, dy, t = flat_x, flat_y, z, z, z
-    for _ in range(6):
-        x, y = camera.position[0] + flat_x * (1 + z / distance), camera.position[1] + flat_y * (1 + z / distance)
+    share = on_pad[:, 2] / ball_radius
+    heights, at, a = _heights(slopes, share), on_pad[press, :2], on_pad[press, 2]
+    z = np.zeros(len(press))
+    x, y, dx, dy, rho, t = z, z, z, z, z, z
+    for _ in range(_STEPS):
+        x, y = _along_rays(sensor.camera, places, z)
         dx, dy = x - at[:, 0], y - at[:, 1]
-        t = np.where(pressed, np.hypot(dx, dy) / a, KNOTS[-1])
+        rho = np.hypot(dx, dy)
+        t = rho / a
         place = np.minimum(t / (_TABLE[1] - _TABLE[0]), len(_TABLE) - 1.001)
         k = place.astype(int)
         part = place - k
-        height = heights[own, k] * (1 - part) + heights[own, k + 1] * part
+        height = heights[press, k] * (1 - part) + heights[press, k + 1] * part
         z = -sensor.gelpad.sag(x, y) - a * height
-    tan = np.where(pressed, _slope(slopes, t, a_share), 0)
-    rho = np.maximum(np.hypot(dx, dy), 1e-9)
+    tan = _slope(slopes, t, share[press])
+    rho = np.maximum(rho, 1e-9)
     zx, zy = sensor.gelpad.slope(x, y)
-    n = np.stack([zx + tan * dx / rho, zy + tan * dy / rho, -np.ones_like(x)])
-    return PixelGeometry(np.stack([x, y, z]), n / np.linalg.norm(n, axis=0))
+    return _facing(x, y, z, zx + tan * dx / rho, zy + tan * dy / rho)
+
+
+def rest_geometry(sensor: SensorSpec, places: tuple[np.ndarray, np.ndarray]) -> PixelGeometry:
+    """Coat at rest, seen by the pixels of ``places``, as of ``pixel_geometry``."""
+    z = np.zeros(len(places[0]))
+    x, y = z, z
+    for _ in range(_STEPS):
+        x, y = _along_rays(sensor.camera, places, z)
+        z = -sensor.gelpad.sag(x, y)
+    return _facing(x, y, z, *sensor.gelpad.slope(x, y))
+
+
+def _along_rays(camera: CameraSpec, places: tuple[np.ndarray, np.ndarray], z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x and y [m] at the height ``z`` of the rays through ``places`` on z = 0."""
+    nearer = 1 - z / camera.position[2]
+    return camera.position[0] + places[0] * nearer, camera.position[1] + places[1] * nearer
+
+
+def _facing(x: np.ndarray, y: np.ndarray, z: np.ndarray, zx: np.ndarray, zy: np.ndarray) -> PixelGeometry:
+    """Points whose normals, by the slopes ``zx`` and ``zy``, look to the camera."""
+    n = np.stack([zx, zy, -np.ones_like(x)])
+    return PixelGeometry(np.stack([x, y, z]), n / np.sqrt(zx * zx + zy * zy + 1))
 
 
 def press_surface(

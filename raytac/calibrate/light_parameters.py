@@ -10,15 +10,16 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from raytac.calibrate.camera_view import ROUNDED, view_of, with_view
+from raytac.calibrate.camera_view import ROUNDED, camera_with_view, view_of, with_view
 from raytac.calibrate.photographs import decode
 from raytac.errors import InputError
 from raytac.optics.trace.quadrature import EdgePoints, quadrature
 from raytac.specs import LedSpec, LightsSpec, SensorSpec
-from raytac.specs.sensor_check import view_edges
+from raytac.specs.sensor_check import camera_edges, view_edges
 from raytac.specs.tone import STRAIGHT, ToneCurve
 
 CHANNELS = ("red", "green", "blue")
@@ -109,12 +110,12 @@ class LightParameters:
         """The tone curve."""
         return ToneCurve(tuple(self.tone))
 
-    @property
+    @cached_property
     def layer(self) -> np.ndarray:
         """Index in ``CHANNELS`` of every LED's layer, (L,)."""
         return np.array([CHANNELS.index(led.layer) for led in self.template.leds])
 
-    @property
+    @cached_property
     def virtual(self) -> np.ndarray:
         """True for virtual sources, (L,)."""
         return np.array([led.virtual for led in self.template.leds])
@@ -324,9 +325,11 @@ def _beside_view(sensor: SensorSpec, p: LightParameters) -> tuple[np.ndarray, np
     """Least and largest x and y [mm] of what LEDs reach, (L, 2) each."""
     half = 5e2 * np.array(sensor.case.size)
     low, high = (np.tile(sign * half, (len(p.leds), 1)) for sign in (-1, 1))
-    edges = 1e3 * np.array(view_edges(with_view(sensor, p.view)))
-    for k, (axis, end) in _sides(sensor, p).items():
-        (high, low)[end][k, axis] = edges[axis, end]
+    sides = _sides(sensor, p)
+    if sides:
+        edges = 1e3 * np.array(camera_edges(camera_with_view(sensor.camera, *map(float, p.view))))
+        for k, (axis, end) in sides.items():
+            (high, low)[end][k, axis] = edges[axis, end]
     return low, high
 
 
@@ -335,8 +338,12 @@ def _sides(sensor: SensorSpec, p: LightParameters) -> dict[int, tuple[int, int]]
 
     A side is its axis, 0 or 1, and 0 for its low end or 1 for its high one.
     """
-    sides, edges = {}, view_edges(sensor)
-    for k in map(int, np.flatnonzero(p.virtual)):
+    sides: dict[int, tuple[int, int]] = {}
+    virtual = np.flatnonzero(p.virtual)
+    if not len(virtual):
+        return sides
+    edges = view_edges(sensor)
+    for k in map(int, virtual):
         place = p.template.leds[k].position
         beyond = {(axis, end): sign * (place[axis] - edges[axis][end]) for axis in (0, 1) for end, sign in enumerate((-1, 1))}
         sides[k] = max(beyond, key=lambda side: beyond[side])

@@ -43,12 +43,7 @@ class Photographs:
 
     def shrunk(self, factor: int) -> Photographs:
         """Mean of every ``factor`` × ``factor`` pixels."""
-
-        def mean(image: np.ndarray) -> np.ndarray:
-            *batch, height, width, _ = image.shape
-            return image.reshape(*batch, height // factor, factor, width // factor, factor, 3).mean((-4, -2))
-
-        return dataclasses.replace(self, background=mean(self.background), presses=mean(self.presses))
+        return dataclasses.replace(self, background=shrunk(self.background, factor), presses=shrunk(self.presses, factor))
 
     def distance(self, sensor: SensorSpec) -> np.ndarray:
         """Distance of every pixel from the circle's centre over its radius, (N, H, W)."""
@@ -56,6 +51,17 @@ class Photographs:
         v, u = (np.mgrid[:height, :width] + 0.5) * sensor.camera.resolution[0] / width
         x, y, r = self.circles.T[:, :, None, None]
         return np.hypot(u - x, v - y) / r
+
+
+def shrunk(images: np.ndarray, factor: int) -> np.ndarray:
+    """Mean of every ``factor`` × ``factor`` pixels of images (..., H, W, 3)."""
+    *batch, height, width, _ = images.shape
+    rows = images.reshape(*batch, height // factor, factor, width, 3).sum(-3)
+    # Ten times faster than a mean over both axes, which goes through memory pixel by pixel.
+    total = rows[..., ::factor, :]
+    for k in range(1, factor):
+        total = total + rows[..., k::factor, :]
+    return total / factor**2
 
 
 def encode(linear: np.ndarray, gamma: float, curve: ToneCurve = STRAIGHT) -> np.ndarray:

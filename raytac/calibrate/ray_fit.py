@@ -20,7 +20,7 @@ from raytac.calibrate.direct_fit import REST_FACTOR, SIGMA, DirectFit, FitSettin
 from raytac.calibrate.direct_light import ExtraLight, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LENGTH, SHORTEST, LightParameters, with_parameters
-from raytac.calibrate.photographs import Photographs, decode
+from raytac.calibrate.photographs import Photographs, decode, shrunk
 from raytac.errors import InputError, SpecError
 from raytac.gel.surface import GelSurface, PadGrid, make_grid
 from raytac.optics.base import casts_shadows
@@ -103,7 +103,7 @@ def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, trac
         pressed[:, here] = layers(surface)[:, problem.press[here] - first, problem.row[here], problem.column[here]]
     still = layers(GelSurface.at_rest(grid))[:, 0]
     by = REST_FACTOR * height // problem.shots.background.shape[0]
-    rest = still.reshape(len(still), height // by, by, width // by, by, 3).mean((2, 4)).reshape(len(still), -1, 3)
+    rest = shrunk(still, by).reshape(len(still), -1, 3)
     return Light(pressed, still[:, problem.row, problem.column], rest).plus(problem.light(state), -1.0)
 
 

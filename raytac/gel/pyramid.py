@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -100,8 +100,9 @@ class ElasticSurround:
         elif steps is None:
             steps = tuple((share * thickness, gain) for share, gain in LAYER_STEPS)
         resolved = _resolved(steps or (), finest)
-        self._pyramid = [_Gaussian(grid, sigma, gain, self._lanes, self.device) for sigma, gain in resolved]
-        self._final = _Gaussian(grid, final_sigma, 1.0, self._lanes, self.device) if final_sigma > finest else None
+        places = grid.shape, grid.pitch, self._lanes, self.device.alias
+        self._pyramid = [_gaussian(sigma, gain, *places) for sigma, gain in resolved]
+        self._final = _gaussian(final_sigma, 1.0, *places) if final_sigma > finest else None
         spread = np.cumsum(np.square([*(sigma for sigma, _ in resolved), final_sigma]))
         self._reaches = [np.ceil(_REACH * np.sqrt(one) / grid.pitch).astype(int) + 2 for one in spread]
         """Nodes along x and y that each Gaussian, with those before, reaches."""
@@ -243,9 +244,11 @@ def _resolved(steps: tuple[tuple[float, float], ...], finest: float) -> list[tup
 class _Gaussian:
     """One Gaussian as products with matrices along both axes, on the device."""
 
-    def __init__(self, grid: PadGrid, sigma: float, gain: float, lanes: int, device: Any) -> None:
+    def __init__(
+        self, sigma: float, gain: float, shape: tuple[int, int], pitch: tuple[float, float], lanes: int, device: Any
+    ) -> None:
         """``sigma`` [m]; ``gain``: sum of its weights; ``lanes``: nodes in a packet."""
-        (ny, nx), (dx, dy) = grid.shape, grid.pitch
+        (ny, nx), (dx, dy) = shape, pitch
         (along_y, reach_y), (along_x, reach_x) = gaussian_matrix(ny, sigma / dy), gaussian_matrix(nx, sigma / dx)
         self.reach = np.array([reach_x, reach_y])
         """Nodes along x and y."""
@@ -255,6 +258,12 @@ class _Gaussian:
         across, self.across_band = _blocks(along_x, lanes, device)
         self.across = wp.array(across, dtype=kernels.packet_types(lanes)[0], device=device)
         """Weights of a packet of columns in a vector, (Nx, packets)."""
+
+
+_gaussian = lru_cache(32)(_Gaussian)
+"""Gaussians that pads of one grid share; nothing writes to them.
+
+A pad has up to eight, of a megabyte or less."""
 
 
 def _blocks(matrix: np.ndarray, size: int, device: Any) -> tuple[np.ndarray, wp.array]:

@@ -14,7 +14,7 @@ from raytac.errors import InputError, MeshError, SpecError
 from raytac.gel.surface import GelSurface, make_grid
 from raytac.physics.base import PadReading, TargetArrays
 from raytac.physics.objects import object_parts
-from raytac.se3 import rotation_of
+from raytac.se3 import rotation_of, rotations
 from raytac.shapes.part import Part
 from raytac.shapes.underside import object_height
 from raytac.specs.press import PressScene, StageSpec
@@ -104,6 +104,18 @@ class PressTargets:
         """Final angle of a twist [rad], (B,); 0 in a lost environment."""
         return self._final("twist", stage)
 
+    def turn(self, stage: StageSpec, turn: np.ndarray) -> np.ndarray:
+        """Turn (B, 3) [rad], as of ``turn_rotations``, at the end of a ``twist`` or ``tilt``.
+
+        The other angles are those of ``turn`` (B, 3). In a lost environment the stage's own are 0.
+        """
+        final = turn.copy()
+        if stage.kind == "twist":
+            final[:, 2] = self.twist(stage)
+        else:
+            final[:, :2] = np.where(self.lost[:, None], 0.0, stage.tilt)
+        return final
+
     def _final(self, name: str, stage: StageSpec) -> np.ndarray:
         values = self._own_targets[name]
         values = np.array([getattr(stage, name)] * len(self.lost)) if values is None else values
@@ -150,6 +162,8 @@ class PressTargets:
             name, value = "shear_mm", [float(f"{v * 1e3:.6g}") for v in stage.shear]
         elif stage.kind == "twist":
             name, value = "twist_deg", float(f"{np.degrees(stage.twist):.6g}")
+        elif stage.kind == "tilt":
+            name, value = "tilt_deg", [float(f"{np.degrees(v):.6g}") for v in stage.tilt]
         else:
             name, value = {"depth [mm]": "depth_mm"}.get(error.name, "force_n"), error.value
         return SpecError(kept + error.rule, file=self._scene.source, key=f"trajectory[{index}].{name}", value=value)
@@ -171,6 +185,15 @@ class PressTargets:
 def _rotation(quaternion: np.ndarray) -> np.ndarray:
     """Rotation (3, 3) of a quaternion wxyz of any length but 0."""
     return rotation_of(quaternion / np.linalg.norm(quaternion))
+
+
+TURNS = ("twist", "tilt")
+"""Kinds of stage that turn the object."""
+
+
+def turn_rotations(turn: np.ndarray) -> np.ndarray:
+    """Rotations (…, 3, 3) of a ``turn`` (…, 3) [rad]: tilt along x and y, then twist about z."""
+    return rotations(turn * (0.0, 0.0, 1.0)) @ rotations(turn * (1.0, 1.0, 0.0))
 
 
 CLEARANCE = 1e-3
@@ -261,8 +284,8 @@ class PressPad(ABC):
         """Readings: one lifted by ``CLEARANCE``, then ``steps_per_stage`` through each stage.
 
         Targets are reached in straight lines. An ``indent`` to a depth moves the object there; one to a force pushes until the contact
-        balances it, and keeps that force through a shear or twist that follows. A ``release`` lifts the object ``CLEARANCE`` above the
-        gel. ``progress``: a pad that takes long shows a bar on a terminal.
+        balances it, and keeps that force through a shear, twist or tilt that follows. A ``release`` lifts the object ``CLEARANCE`` above
+        the gel. ``progress``: a pad that takes long shows a bar on a terminal.
 
         Raises:
             InputError: ``steps_per_stage`` below 1. An environment whose own target takes the object off the pad, or past the gel's bonded

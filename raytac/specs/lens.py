@@ -73,39 +73,42 @@ class Lens:
             rows = zip(*self.rotation, strict=True)
             along = [a * tx + b * ty + c for a, b, c in rows]
             x, y = along[0] / along[2], along[1] / along[2]
-        return self._distorted(x, y) if self.distorts else (x, y)
+        return self._distorted(x, y, *self._radial(x, y)) if self.distorts else (x, y)
 
     def determinant(self, x: Any, y: Any) -> Any:
         """Area of the image over that without distortion at undistorted (x, y); ≤ 0 where it folds."""
-        xx, xy, yy = self._jacobian(x, y)
+        xx, xy, yy = self._jacobian(x, y, *self._radial(x, y))
         return xx * yy - xy * xy
 
-    def _distorted(self, x: Any, y: Any) -> tuple[Any, Any]:
-        k1, k2, p1, p2 = self.distortion
+    def _radial(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """r² and 1 + k1 r² + k2 r⁴."""
+        k1, k2, _, _ = self.distortion
         r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + k2 * r2)
-        return (
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        )
+        return r2, 1 + r2 * (k1 + k2 * r2)
 
-    def _jacobian(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
+    def _distorted(self, x: Any, y: Any, r2: Any, radial: Any) -> tuple[Any, Any]:
+        _, _, p1, p2 = self.distortion
+        x_d, y_d = x * radial, y * radial
+        if not (p1 or p2):
+            return x_d, y_d
+        return x_d + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y_d + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+
+    def _jacobian(self, x: Any, y: Any, r2: Any, radial: Any) -> tuple[Any, Any, Any]:
         """∂x_d/∂x, ∂x_d/∂y = ∂y_d/∂x and ∂y_d/∂y."""
         k1, k2, p1, p2 = self.distortion
-        r2 = x * x + y * y
-        radial, rise = 1 + r2 * (k1 + k2 * r2), 2 * (k1 + 2 * k2 * r2)
-        return (
-            radial + rise * x * x + 2 * p1 * y + 6 * p2 * x,
-            rise * x * y + 2 * p1 * x + 2 * p2 * y,
-            radial + rise * y * y + 6 * p1 * y + 2 * p2 * x,
-        )
+        rise = 2 * (k1 + 2 * k2 * r2)
+        xx, xy, yy = radial + rise * x * x, rise * x * y, radial + rise * y * y
+        if not (p1 or p2):
+            return xx, xy, yy
+        return xx + 2 * p1 * y + 6 * p2 * x, xy + 2 * p1 * x + 2 * p2 * y, yy + 6 * p1 * y + 2 * p2 * x
 
     def _undistorted(self, x_d: Any, y_d: Any) -> tuple[Any, Any]:
         x, y = x_d, y_d
         for _ in range(_STEPS):
-            at_x, at_y = self._distorted(x, y)
+            r2, radial = self._radial(x, y)
+            at_x, at_y = self._distorted(x, y, r2, radial)
             off_x, off_y = at_x - x_d, at_y - y_d
-            xx, xy, yy = self._jacobian(x, y)
+            xx, xy, yy = self._jacobian(x, y, r2, radial)
             scale = 1 / (xx * yy - xy * xy)
             x, y = x - scale * (yy * off_x - xy * off_y), y - scale * (xx * off_y - xy * off_x)
         return x, y

@@ -46,6 +46,7 @@ STAGE_SCHEMA: Final[dict[str, Schema]] = {
     "indent": {"depth_mm": Number("(0, 50]", default=None), "force_n": Number("(0, 200]", default=None), **_DURATION},
     "shear": {"shear_mm": Number("[-50, 50]", length=2), **_DURATION},
     "twist": {"twist_deg": Number("[-180, 180]"), **_DURATION},
+    "tilt": {"tilt_deg": Number("[-60, 60]", length=2), **_DURATION},
     "release": {**_DURATION},
 }
 """Kind of stage to its keys in ``[[trajectory]]``."""
@@ -109,10 +110,10 @@ class ObjectSpec:
 
 @dataclass(frozen=True)
 class StageSpec:
-    """One stage of the trajectory; targets count from first touch at zero shear and twist."""
+    """One stage of the trajectory; targets count from first touch at zero shear, twist and tilt."""
 
     kind: str
-    """``indent shear twist release``."""
+    """``indent shear twist tilt release``."""
     depth: float | None = None
     """Indentation depth at the end of an ``indent`` stage [m] (exclusive with ``force``)."""
     force: float | None = None
@@ -121,6 +122,10 @@ class StageSpec:
     """Tangential displacement along x and y at the end of a ``shear`` stage [m]."""
     twist: float = 0.0
     """Rotation about +z at the end of a ``twist`` stage [rad]."""
+    tilt: tuple[float, float] = (0.0, 0.0)
+    """Rotation vector along x and y at the end of a ``tilt`` stage [rad].
+
+    It is about the object's origin. A twist turns its axis too."""
     duration: float = 0.5
     """Time that the leg takes [s]."""
 

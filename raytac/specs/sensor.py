@@ -163,9 +163,18 @@ class GelpadSpec:
         """
         if self.surface is not None:
             return -self.surface.height(x, y)
-        return sum(
-            u * u / (radius + (radius * radius - u * u) ** 0.5) for u, radius in zip((x, y), self.dome_radius, strict=True)
-        )
+        if self.is_plane:
+            return 0.0 * (x + y)
+        sags = [
+            u * u / (radius + (radius * radius - u * u) ** 0.5) if math.isfinite(radius) else 0.0 * u
+            for u, radius in zip((x, y), self.dome_radius, strict=True)
+        ]
+        return sags[0] + sags[1]
+
+    @property
+    def is_plane(self) -> bool:
+        """True if the surface at rest is z = 0."""
+        return self.surface is None and self.dome_radius == (math.inf, math.inf)
 
     def slope(self, x: Any, y: Any) -> tuple[Any, Any]:
         """∂z/∂x and ∂z/∂y of the surface at rest at ``x``, ``y`` [m] on the pad."""
@@ -234,6 +243,9 @@ class CameraSpec:
 
     def __post_init__(self) -> None:
         check_fields(vars(self), SENSOR_SCHEMA["camera"], "camera")
+        for name, value in vars(self).items():
+            if isinstance(value, list):  # so that cameras can be compared, and results kept by camera
+                object.__setattr__(self, name, tuple(value))
 
     @property
     def lens(self) -> Lens:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
 from raytac.errors import SpecError
 from raytac.specs.height_map import HeightMap
 from raytac.specs.lens import Lens
-from raytac.specs.sensor import LedSpec, SensorSpec, Vec3, shading_degree
+from raytac.specs.sensor import CameraSpec, LedSpec, SensorSpec, Vec3, shading_degree
 from raytac.specs.toml import in_mm
 from raytac.specs.tone import LEAST_SLOPE, MOST_COEFFICIENTS
 
@@ -130,6 +131,7 @@ def _check_camera(sensor: SensorSpec) -> None:
         rule = f"the camera must lie between the case's walls, |x| <= {case.size[0] * 500:.4g} mm, |y| <= {case.size[1] * 500:.4g} mm"
         raise _error(sensor, "camera.position_mm", in_mm(camera.position), rule)
     _check_lens(sensor)
+    edges = view_edges(sensor)
     if camera.lens.is_plain:
         view = tuple(n * pitch for n, pitch in zip(camera.resolution, camera.pixel_pitch, strict=True))
         centre = tuple(
@@ -137,8 +139,7 @@ def _check_camera(sensor: SensorSpec) -> None:
             for at, n, principal, pitch in zip((x, y), camera.resolution, camera.principal_point, camera.pixel_pitch, strict=True)
         )
     else:
-        _check_view(sensor)
-        edges = view_edges(sensor)
+        _check_view(sensor, edges)
         view, centre = tuple(high - low for low, high in edges), tuple(0.5 * (low + high) for low, high in edges)
     if any(abs(c) > size / 2 for c, size in zip(centre, pad.size, strict=True)):
         rule = f"the camera does not see the pad: its view is centred at {in_mm(centre)} mm, off the pad of {in_mm(pad.size)} mm"
@@ -147,7 +148,8 @@ def _check_camera(sensor: SensorSpec) -> None:
         if any(v > size + _SLACK for v, size in zip(view, outer, strict=True)):
             rule = f"the view of {in_mm(view)} mm (resolution times pitch) must not be larger than the {name}, {in_mm(outer)} mm"
             raise _error(sensor, "camera.pixel_pitch_mm", in_mm(camera.pixel_pitch), rule)
-    _check_view(sensor)
+    if camera.lens.is_plain:
+        _check_view(sensor, edges)
 
 
 def _check_lens(sensor: SensorSpec) -> None:
@@ -177,15 +179,15 @@ def _check_lens(sensor: SensorSpec) -> None:
         raise _error(sensor, "camera.tilt_deg", tilt, rule)
 
 
-def _check_view(sensor: SensorSpec) -> None:
+def _check_view(sensor: SensorSpec, view: tuple[tuple[float, float], tuple[float, float]]) -> None:
     """The outermost pixels see the pad: x = position_x + (u − cx) · pitch at z = 0, y alike.
 
-    A map may rise above z = 0, where the view is wider.
+    ``view``: ``view_edges``. A map may rise above z = 0, where the view is wider.
     """
     pad, camera = sensor.gelpad, sensor.camera
     top = 0.0 if pad.surface is None else max(0.0, float(_at_rest(pad.size, pad.surface)[2].max()))
     wider = 1.0 - top / camera.position[2]
-    for axis, (name, edges) in enumerate(zip("xy", view_edges(sensor), strict=True)):
+    for axis, (name, edges) in enumerate(zip("xy", view, strict=True)):
         low, high = (camera.position[axis] + wider * (edge - camera.position[axis]) for edge in edges)
         at, principal = camera.position[axis], camera.principal_point[axis]
         pixels, pitch = camera.resolution[axis], camera.pixel_pitch[axis]
@@ -291,7 +293,12 @@ def _check_led(sensor: SensorSpec, index: int, led: LedSpec) -> None:
 
 def view_edges(sensor: SensorSpec) -> tuple[tuple[float, float], tuple[float, float]]:
     """Lowest and highest x, then y, of the camera's view of z = 0 [m]; below it is narrower."""
-    camera = sensor.camera
+    return camera_edges(sensor.camera)
+
+
+@lru_cache(1024)  # a check asks several times, a fit for the same views again and again
+def camera_edges(camera: CameraSpec) -> tuple[tuple[float, float], tuple[float, float]]:
+    """``view_edges`` of a camera."""
     if not camera.lens.is_plain:
         slopes, depth = camera.border(), -camera.position[2]
         x, y = (

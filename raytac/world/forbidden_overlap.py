@@ -84,7 +84,10 @@ class RobotOverlap:
         self._parts = {int(g): geom_part(model, int(g)) for g in self._robot if int(model.geom_type[g]) in known}
 
     def rigid(self, envs: Sequence[int] | range | np.ndarray) -> Iterator[tuple[int, Inside]]:
-        """Mirrored bodies inside the robot at the present poses (after ``mj_kinematics``), by environment."""
+        """Mirrored bodies inside the robot, by environment, at the present poses.
+
+        After ``mj_kinematics``.
+        """
         if self._places is None:
             return
         chosen, own = np.asarray(envs, int), len(self._own)

@@ -60,6 +60,26 @@ def test_every_view_inside_the_bounds_is_a_sensor(name: str, fixed: tuple[str, .
         np.testing.assert_array_equal(again.view, kept.view, err_msg="what is inside stays")
 
 
+@pytest.mark.parametrize("name", SENSORS)
+def test_bounds_of_an_led_depend_on_no_other(name: str) -> None:
+    """Derivatives along bounds move all LEDs at once."""
+    problem, state = problem_of(load_sensor(name))
+    rng, (count, wide) = np.random.default_rng(3), state.p.leds.shape
+    leds = state.p.leds + rng.normal(size=(count, wide)) * [6, 6, 3, 0.3, 0.3, 0.5, 4, 4]
+
+    def inside(leds: np.ndarray) -> np.ndarray:
+        return problem.inside_bounds(dataclasses.replace(state, p=dataclasses.replace(state.p, leds=leds))).p.leds
+
+    kept = inside(leds)
+    assert (kept != leds).any(), "some are at bounds"
+    for k in range(count):
+        other = leds.copy()
+        other[k] += rng.normal(size=wide) * 0.2
+        moved = inside(other)
+        assert (moved[k] != kept[k]).any()
+        np.testing.assert_array_equal(np.delete(moved, k, 0), np.delete(kept, k, 0))
+
+
 def test_a_fit_of_a_barrel_lens_ends_in_a_sensor(tmp_path: Path) -> None:
     """Light from where the true view, wider than the given one, would see its source: sources stay beside the fitted view."""
     mini = load_sensor("gelsight_mini")

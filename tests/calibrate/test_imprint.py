@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from raytac.calibrate.imprint import KNOTS, RIGID_PAD, circles_on_pad, pixel_geometry, press_surface
+from raytac.calibrate.imprint import KNOTS, RIGID_PAD, circles_on_pad, on_plane, pixel_geometry, press_surface, rest_geometry
 from raytac.errors import InputError
 from raytac.gel.surface import make_grid
 from raytac.specs import SensorSpec, load_sensor
@@ -39,9 +39,9 @@ def test_pixels_see_the_surface(mini: SensorSpec) -> None:
     rng = np.random.default_rng(0)
     press = np.repeat([0, 1], 200)
     u, v = (CIRCLES[press, k] + rng.uniform(-50, 50, 400) for k in (0, 1))
-    seen = pixel_geometry(mini, u, v, press, CIRCLES, RADIUS, RIGID_PAD)
-    # On the ray of the pixel …
     camera = mini.camera
+    seen = pixel_geometry(mini, on_plane(camera, u, v), press, circles_on_pad(mini, CIRCLES, RADIUS), RADIUS, RIGID_PAD)
+    # On the ray of the pixel …
     for k, pixel in enumerate((u, v)):
         share = (seen.p[2] - camera.position[2]) / -camera.position[2]
         np.testing.assert_allclose(seen.p[k], (pixel - camera.principal_point[k]) * camera.pixel_pitch[k] * share, atol=1e-9)
@@ -55,6 +55,26 @@ def test_pixels_see_the_surface(mini: SensorSpec) -> None:
     normal /= np.linalg.norm(normal, axis=0)
     assert np.median(np.abs(normal - seen.n)) < 0.01 < np.abs(seen.n[:2]).max()
     np.testing.assert_allclose(np.linalg.norm(seen.n, axis=0), 1)
+
+
+@pytest.mark.parametrize("name", ["gelsight_mini", "gelsight_dome"])
+def test_pixels_see_the_coat_at_rest(name: str) -> None:
+    """On the pixel's ray, on the surface at rest, and with its normal by differences."""
+    sensor = load_sensor(name)
+    camera, pad = sensor.camera, sensor.gelpad
+    u, v = np.random.default_rng(0).uniform(0.3, 0.7, (2, 200)) * np.array(camera.resolution)[:, None]
+    seen = rest_geometry(sensor, on_plane(camera, u, v))
+    x, y, z = seen.p
+    np.testing.assert_allclose(z, -pad.sag(x, y), atol=1e-7)
+    tx, ty = ((seen.p[k] - camera.position[k]) / (z - camera.position[2]) for k in (0, 1))
+    focal, middle = camera.focal, camera.principal_point
+    for image, pixel, f, c in zip(camera.lens.image(tx, ty), (u, v), focal, middle, strict=True):
+        np.testing.assert_allclose(f * image + c, pixel, atol=1e-6)
+    rise = np.stack(
+        [pad.sag(x - 1e-6, y) - pad.sag(x + 1e-6, y), pad.sag(x, y - 1e-6) - pad.sag(x, y + 1e-6), np.full(200, -2e-6)]
+    )
+    np.testing.assert_allclose(seen.n, rise / np.linalg.norm(rise, axis=0), atol=1e-6)
+    assert (np.abs(seen.n[:2]).max() > 0.05) == (name == "gelsight_dome")
 
 
 def test_a_deeper_rim_is_seen_farther_out(mini: SensorSpec) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
-from raytac.calibrate.direct_light import led_light
+from raytac.calibrate.direct_light import led_light, led_slopes
 from raytac.calibrate.imprint import RIGID_PAD, PixelGeometry
 from raytac.calibrate.light_parameters import HEIGHT, LENGTH, LightParameters, with_parameters
 from raytac.calibrate.model_fits import images_of, raytrace_mode
@@ -63,12 +63,13 @@ def test_light_of_a_strip_is_its_closed_form(lamp, formula) -> None:
     flat = PixelGeometry(p, np.tile([[0.0], [0.0], [-1.0]], p.shape[1]))
     plain = with_lights(strips(-6.0), LightsSpec((dataclasses.replace(lamp, layer="red"),)))
     parameters = rows(plain)
-    found = led_light(flat, parameters.leds[0], parameters.points[0], 1.0).light
+    found = led_light(flat, parameters.leds[0], parameters.points[0], 1.0)
     expected = formula(lamp, p.T)
     np.testing.assert_allclose(found, expected, rtol=0.01)
+    np.testing.assert_array_equal(led_slopes(flat, parameters.leds[0], parameters.points[0], 1.0).light, found)
     small = dataclasses.replace(lamp, size=(1e-4, 1e-4))
     middle = rows(with_lights(plain, LightsSpec((dataclasses.replace(small, layer="red"),))))
-    assert np.abs(led_light(flat, middle.leds[0], middle.points[0], 1.0).light / expected - 1).max() > 0.1
+    assert np.abs(led_light(flat, middle.leds[0], middle.points[0], 1.0) / expected - 1).max() > 0.1
 
 
 @pytest.mark.parametrize("size", [(18.0, 1.0), (18.0, 4.0), (4.0, 6.0), (1.0, 0.5)])

@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import real_force, real_markers
-from experiments.layer_motion import layer_motion
+from experiments import drag_photographs, real_force, real_markers
+from experiments.drag_photographs import BallMotion, ball_points, layer_motion
 from raytac.calibrate import ball_forces, modulus_factor
 from raytac.errors import InputError
 from raytac.io.images import write_png
 from raytac.io.metrics import read_metrics
+from raytac.markers import camera_of
 from raytac.markers.registry import markers_config
 from raytac.physics import Rigid
+from raytac.se3 import rotations
 from raytac.specs import load_sensor
 
 SIZE, PITCH = (320, 240), 0.0532
@@ -73,30 +75,63 @@ def test_ratios_that_no_gel_has_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_rolling_balls_motion_is_read_from_its_layers(dots: np.ndarray) -> None:
-    """Rings of a tilted ball that moves and rolls, under dots that do not go along."""
-    radius, centre = 50.0, np.array([150.0, 118.0])
-    lowest, roll = np.array([-2.0, 9.0]), np.array([-0.05, 0.06])
+    """Rings of a ball whose layers lie askew, which moves and tilts under a pinhole, under dots that do not go along."""
+    sensor = real_markers.photographed(load_sensor("gelsight_mini"), SIZE, PITCH / 1e3)
+    height, pitch = -sensor.camera.position[2], PITCH / 1e3
+    centre, shear, tilt = np.array([-0.5e-3, 0.2e-3, 1.6e-3]), np.array([0.1e-3, 0.45e-3]), np.array([0.03, 0.06])
     v, u = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
 
-    def rings(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        height = np.sqrt(np.maximum(radius**2 - x**2 - y**2, 0.0))
-        axis = np.array([0.25, -0.1, 0.963])
-        layer = (axis[0] * x + axis[1] * y + axis[2] * height) / 2.5
-        return np.where(x**2 + y**2 < (0.75 * radius) ** 2, 6.0 * np.cos(2.0 * np.pi * layer), 0.0)
+    def photographed(at: np.ndarray, turned: np.ndarray) -> np.ndarray:
+        """Rings where the ray of each pixel from the pinhole meets the ball at ``at``."""
+        ray = np.stack([(u - SIZE[0] / 2) * pitch / height, (v - SIZE[1] / 2) * pitch / height, np.ones_like(u)], axis=-1)
+        start = np.array([0.0, 0.0, -height]) - at
+        a, b, c = (ray**2).sum(axis=-1), ray @ start, start @ start - BALL**2
+        root = b**2 - a * c
+        own = (start + ((-b - np.sqrt(np.maximum(root, 0.0))) / a)[..., None] * ray) @ turned  # axes of the ball
+        layers = 6.0 * np.cos(2.0 * np.pi * (own @ np.array([0.25, -0.1, 0.963])) / 0.13e-3)
+        return np.where((root > 0.0) & (np.hypot(own[..., 0], own[..., 1]) < 0.75 * BALL), layers, 0.0)
 
-    x, y = u - centre[0], v - centre[1]
-    before, px, py = rings(x, y), x, y
-    for _ in range(30):  # where each pixel of the second photograph was in the first
-        s = np.sqrt(np.maximum(radius**2 - px**2 - py**2, 0.0)) - radius
-        px, py = x - lowest[0] - roll[0] * s, y - lowest[1] - roll[1] * s
-    one, two = (np.clip(photograph(dots) + field[..., None], 0, 255).astype(np.uint8) for field in (before, rings(px, py)))
-    motion = layer_motion(one, two, np.array([*centre, 36.0]), radius)
-    np.testing.assert_allclose(motion.lowest, lowest, atol=0.25)
-    np.testing.assert_allclose(motion.roll, roll, atol=0.015)
-    np.testing.assert_allclose(motion.centre, lowest - radius * roll, atol=0.8)
-    assert motion.correlation > motion.without_roll + 0.005
-    figures = motion.figures(50.0)
-    assert figures["lowest_y_um"] == pytest.approx(450.0, abs=8.0) and figures["roll_y_deg"] == pytest.approx(3.4, abs=0.9)
+    moved = centre + np.array([*shear, 0.0])
+    fields = photographed(centre, np.eye(3)), photographed(moved, rotations(np.array([*tilt, 0.0])))
+    grain = np.random.default_rng(3).normal(size=(2, *SIZE[::-1]))
+    images = tuple(
+        np.clip(photograph(dots) + (field + noise)[..., None], 0, 255).astype(np.uint8)
+        for field, noise in zip(fields, grain, strict=True)
+    )
+    circle = np.array([*camera_of(sensor).project(centre - [0.0, 0.0, BALL]), 38.0])
+    read = layer_motion(images, sensor, circle, centre, BALL)
+    np.testing.assert_allclose(read.motion.lowest(BALL), shear + BALL * np.array([-tilt[1], tilt[0]]), atol=0.012e-3)
+    np.testing.assert_allclose(read.motion.tilt, tilt, atol=0.012)
+    np.testing.assert_allclose(read.motion.shear, shear, atol=0.04e-3)
+    assert read.correlation > read.without_roll + 0.01
+    edges = sorted(read.annuli)
+    assert min(read.annuli[edge] for edge in edges if edge < 36.0) > 0.75  # the rings end at 0.75 radii, 42 px
+    assert max(abs(read.annuli[edge]) for edge in edges if edge > 43.0) < 0.3
+    figures = read.figures(BALL)
+    assert figures["centre_y_um"] == pytest.approx(450.0, abs=40.0) and figures["tilt_y_deg"] == pytest.approx(3.4, abs=0.7)
+
+
+def test_a_ball_is_seen_where_its_points_are_projected() -> None:
+    sensor = real_markers.photographed(load_sensor("gelsight_mini"), SIZE, PITCH / 1e3)
+    centre = np.array([0.5e-3, -0.3e-3, 1.7e-3])
+    u, v = np.array([150.0, 170.0, 190.0]), np.array([110.0, 115.0, 120.0])
+    points = ball_points(sensor, u, v, centre, BALL)
+    np.testing.assert_allclose(np.linalg.norm(points - centre, axis=1), BALL, rtol=1e-9)
+    assert (points[:, 2] < centre[2]).all()  # its near side
+    np.testing.assert_allclose(camera_of(sensor).project(points), np.column_stack([u, v]), atol=1e-9)
+    assert np.isnan(ball_points(sensor, np.array([20.0]), np.array([20.0]), centre, BALL)).all()
+
+
+def test_smooth_parts_name_the_motion_that_explains_a_difference(dots: np.ndarray) -> None:
+    x, y = ((dots - dots.mean(axis=0)) / 100.0).T
+    turned = np.column_stack([0.3 - 0.5 * y + 0.2 * x, 0.1 + 0.5 * x + 0.2 * y])
+    assert max(real_markers.smooth_parts(dots, turned).values()) < 1e-9
+    sheared = real_markers.smooth_parts(dots, np.column_stack([0.5 * y, 0.0 * y]))
+    assert sheared["affine"] < 1e-9 < 0.05 < sheared["turn_and_scale"]
+    bent = real_markers.smooth_parts(dots, np.column_stack([x * y, 0.5 * x * x]))
+    assert bent["quadratic"] < 1e-9 < 0.05 < bent["affine"]
+    noise = np.random.default_rng(2).normal(size=dots.shape)  # held-out dots gain nothing from what is fitted to noise
+    assert all(rms > 0.98 * np.sqrt((noise**2).sum(axis=1).mean()) for rms in real_markers.smooth_parts(dots, noise).values())
 
 
 UNKNOWN = ("vary", "colour=1,2"), ("vary", "friction=1"), ("vary", "friction=a,b"), ("vary", "bonded=back,glue")
@@ -129,16 +164,16 @@ def dots() -> np.ndarray:
 
 
 def test_centroids_of_dots_are_right_below_a_pixel(dots: np.ndarray) -> None:
-    centres, areas = real_markers.dot_centres(photograph(dots), np.rint(dots) + np.array([3.0, -2.0]))
+    centres, areas = drag_photographs.dot_centres(photograph(dots), np.rint(dots) + np.array([3.0, -2.0]))
     assert np.abs(centres - dots).max() < 0.04 and areas.min() > 50.0
-    _, none = real_markers.dot_centres(photograph(dots[:1]), dots[:1] + 60.0)
-    assert none[0] < real_markers.LEAST
+    _, none = drag_photographs.dot_centres(photograph(dots[:1]), dots[:1] + 60.0)
+    assert none[0] < drag_photographs.LEAST
 
 
 def test_a_rigid_motion_is_recovered() -> None:
     places = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 8.0]])
     turned = 0.01 * np.column_stack([-(places[:, 1] - 2.0), places[:, 0] - 1.0])
-    moved, turn = real_markers.rigid_motion(places, turned + np.array([3.0, -1.0]), np.array([1.0, 2.0]))
+    moved, turn = drag_photographs.rigid_motion(places, turned + np.array([3.0, -1.0]), np.array([1.0, 2.0]))
     np.testing.assert_allclose(moved, (3.0, -1.0), atol=1e-12)
     assert turn == pytest.approx(0.01)
 
@@ -149,7 +184,7 @@ def test_a_model_recovers_its_own_drag_with_its_constant(tmp_path: Path, dots: n
     ball = real_markers.pressed_ball(sensor, CIRCLE, BALL, "cpu")
     assert ball.surface is not None
     dragged = real_markers.Dragged(sensor, ball, BALL, "coarse", "cpu")
-    motion = dragged.motion(markers_config("fots"), dots, DRAG * PITCH / 1e3, TURN) + CONSTANT
+    motion = dragged.motion(markers_config("fots"), dots, BallMotion(DRAG * PITCH / 1e3, turn=TURN)) + CONSTANT
     data = drag_folder(tmp_path, dots, dots + motion)
     args: dict[str, Any] = {
         "circle_px": ",".join(map(str, CIRCLE)),
@@ -157,13 +192,13 @@ def test_a_model_recovers_its_own_drag_with_its_constant(tmp_path: Path, dots: n
         "pitch_mm": PITCH,
         "device": "cpu",
     }
-    real_markers.main(real_markers.Args(data=data, models="fots,force_field", layers=True, out=tmp_path / "run", **args))
+    real_markers.main(real_markers.Args(data=data, models="fots,force_field", out=tmp_path / "run", **args))
     metrics = read_metrics(tmp_path / "run" / "metrics.json")
     assert (metrics["markers.dots"], metrics["markers.lost"]) == (len(dots), 0)
     assert metrics["markers.ball_um"] == pytest.approx(1e3 * PITCH * np.hypot(*(DRAG + CONSTANT)), rel=0.03)
     assert metrics["markers.turn_deg"] == pytest.approx(1.0, abs=0.4)
     assert (tmp_path / "run" / "residuals.png").stat().st_size > 10_000
-    assert float(metrics["markers.layers.correlation"]) < 1.0  # a ball without layers: read, and of no use
+    assert float(metrics["markers.fots.constant.smooth_quadratic_um"]) < 8.0
     fots = {key: float(metrics[f"markers.fots.{key}"]) for key in ("rms_um", "constant.rms_um", "constant.x_um", "constant.y_um")}
     assert fots["constant.rms_um"] < 8.0 < 50.0 < fots["rms_um"]
     np.testing.assert_allclose((fots["constant.x_um"], fots["constant.y_um"]), 1e3 * PITCH * CONSTANT, atol=6.0)
@@ -177,17 +212,17 @@ class Scaled:
     shares: tuple[float, float]
     sensor = load_sensor("gelsight_mini")
 
-    def motion(self, _: Any, before: np.ndarray, drag: np.ndarray, __: float) -> np.ndarray:
-        across = drag / np.asarray(self.sensor.camera.pixel_pitch) * (before[:, :1] - before[:, 0].mean()) / 100.0
+    def motion(self, _: Any, before: np.ndarray, own: BallMotion) -> np.ndarray:
+        across = own.shear / np.asarray(self.sensor.camera.pixel_pitch) * (before[:, :1] - before[:, 0].mean()) / 100.0
         return across * np.array([self.shares[k % 2] for k in range(len(before))])[:, None]
 
 
 def test_a_value_is_chosen_on_one_half_of_the_dots_and_tested_on_the_other(dots: np.ndarray) -> None:
     """Photographs in which the first half goes along by 1 and the second by 2: each is tested with the other's choice."""
-    own = np.array([2.0, 8.0]), 0.0
+    own = BallMotion(np.array([2.0, 8.0]) * np.asarray(Scaled.sensor.camera.pixel_pitch))
     pads: Any = {str(k): Scaled((share, share)) for k, share in enumerate((0.5, 1.0, 2.0))}
-    seen = Scaled((1.0, 2.0)).motion(None, dots, own[0] * np.asarray(Scaled.sensor.camera.pixel_pitch), 0.0)
-    drag = real_markers.Drag(dots, dots + seen, 0, SIZE)
+    seen = Scaled((1.0, 2.0)).motion(None, dots, own)
+    drag = drag_photographs.Drag(dots, dots + seen, 0, SIZE)
     metrics = real_markers.chosen_by_halves(drag, pads, "surface", "friction", own, 10.0)
     assert (metrics["varied.surface.tested_first"], metrics["varied.surface.tested_second"]) == ("2", "1")
     assert float(metrics["varied.surface.1.first_um"]) < 1.0 and float(metrics["varied.surface.2.second_um"]) < 1.0
@@ -197,15 +232,15 @@ def test_a_value_is_chosen_on_one_half_of_the_dots_and_tested_on_the_other(dots:
 
 def test_drags_without_their_files_are_refused(tmp_path: Path, dots: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match=r"0\.png and 1\.png"):
-        real_markers.Drag.read(tmp_path)
+        drag_photographs.Drag.read(tmp_path)
     data = drag_folder(tmp_path, dots, dots)
-    drag = real_markers.Drag.read(data)
+    drag = drag_photographs.Drag.read(data)
     with monkeypatch.context() as patch:
-        patch.setattr(real_markers.Drag, "read", lambda _: drag)  # finding the dots takes longer than all the rest
+        patch.setattr(drag_photographs.Drag, "read", lambda _: drag)  # finding the dots takes longer than all the rest
         check_refused(data, tmp_path)
     (data / "1.csv").write_text("Mx,My\n1,2\n", "utf-8")
     with pytest.raises(InputError, match="Mx, My, dx, dy"):
-        real_markers.Drag.read(data)
+        drag_photographs.Drag.read(data)
 
 
 def check_refused(data: Path, tmp_path: Path) -> None:

@@ -239,6 +239,40 @@ def test_shear_and_twist_move_the_contact_as_commanded() -> None:
     assert sheared.twist_torque[0] == 0.0 < twisted.twist_torque[0]
 
 
+def test_a_tilt_turns_the_object_about_its_origin_before_the_twist() -> None:
+    """The tilt's axis turns with the twist, and a tilted disc touches at its rim, lower by r sin α − (1 − cos α) l/2 less the dome."""
+    stages = indent(0.3e-3), StageSpec("tilt", tilt=(0.0, 0.05)), StageSpec("twist", twist=0.3)
+    _, (_, pressed, tilted, twisted) = press(scene_of("cylinder", *stages))
+    c, s = math.cos(0.05), math.sin(0.05)
+    about_y = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+    np.testing.assert_allclose(tilted.pad_from_object[0, :3, :3], about_y, atol=1e-12)
+    c, s = math.cos(0.3), math.sin(0.3)
+    about_z = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(twisted.pad_from_object[0, :3, :3], about_z @ about_y, atol=1e-12)
+    for state in (tilted, twisted):
+        np.testing.assert_allclose(state.pad_from_object[0, :3, 3], pressed.pad_from_object[0, :3, 3], atol=1e-12)
+    radius, half = float(OBJECTS["cylinder"]["radius"]), 0.5 * float(OBJECTS["cylinder"]["length"])
+    lower = radius * math.sin(0.05) - half * (1.0 - math.cos(0.05)) - float(PAD.sag(radius, 0.0))
+    assert tilted.surface.indentation.max() - 0.3e-3 == pytest.approx(lower, abs=0.004e-3)
+    assert tilted.surface.contact_centre[0, 0] > 0.1e-3 > 10.0 * abs(tilted.surface.contact_centre[0, 1])
+
+
+def test_a_ball_that_rolls_does_not_shear_the_gel() -> None:
+    """Its lowest point stays: shear −R ω × z. A tilt alone shears as R ω × z, up to slip; so a slide against it doubles it."""
+    radius, angle = float(OBJECTS["sphere"]["radius"]), 0.004
+    tilt = StageSpec("tilt", tilt=(0.6 * angle, -0.8 * angle))
+    path = radius * angle * np.array([0.8, 0.6])  # of the lowest point under the tilt alone
+    shear_force = {}
+    for name, shear in (("roll", -path), ("tilt", 0.0 * path), ("slide", path)):
+        stages = indent(0.5e-3), StageSpec("shear", shear=tuple(shear.tolist())), tilt
+        shear_force[name] = press(scene_of("sphere", *stages))[1][-1].shear_force[0]
+    _, states = press(scene_of("sphere", indent(0.5e-3), StageSpec("shear", shear=tuple(path.tolist()))))
+    assert np.hypot(*states[-1].shear_force[0]) > 0.01
+    np.testing.assert_allclose(shear_force["tilt"], states[-1].shear_force[0], rtol=0.01)
+    np.testing.assert_allclose(shear_force["slide"], 2.0 * shear_force["tilt"], rtol=0.01)
+    assert np.hypot(*shear_force["roll"]) < 0.01 * np.hypot(*shear_force["tilt"])
+
+
 def test_shear_force_sticks_then_slips_at_the_friction_limit() -> None:
     stages = [StageSpec("shear", shear=(x, 0.0)) for x in (0.01e-3, 0.02e-3, 2e-3, 3e-3)]
     _, states = press(scene_of("sphere", indent(0.5e-3), *stages))
@@ -319,6 +353,7 @@ def test_moving_the_case_is_the_same_press(kind: str) -> None:
         StageSpec("indent", force=1.5),
         StageSpec("shear", shear=(0.8e-3, -0.5e-3)),
         StageSpec("twist", twist=0.4),
+        StageSpec("tilt", tilt=(0.05, -0.08)),
         StageSpec("release"),
     )
     scene = scene_of(kind, *stages, position=(2e-3, 1e-3, 0.0), quaternion=tilted)

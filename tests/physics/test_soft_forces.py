@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from raytac.errors import InputError
 from raytac.physics.rigid.load_law import LoadLaw
 from raytac.physics.rigid.pad import RigidPad
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
@@ -157,6 +158,32 @@ def test_twist_turns_with_the_object():
     x, y = coat.mesh.rest[here, :2].T
     turned = (x * coat.displacement[0, here, 1] - y * coat.displacement[0, here, 0]).sum() / (x**2 + y**2).sum()
     assert turned == pytest.approx(math.radians(4.0), rel=0.1)
+
+
+def test_a_ball_that_rolls_leaves_the_gel_where_it_was():
+    """A tilt alone moves the gel under a ball by its radius times the angle; with the shear against it, a roll, not at all."""
+    angle = 0.04
+    moved, force = [], []
+    for shear in (0.0, RADIUS * angle):
+        pad = soft(press(indent(0.5e-3), StageSpec("tilt", tilt=(angle, 0.0)), StageSpec("shear", shear=(0.0, -shear))))
+        pressed, _, state = list(pad.run())[1:]
+        coat = state.surface.coat
+        assert coat is not None and pressed.surface.coat is not None
+        under = np.linalg.norm(coat.mesh.rest[:, :2], axis=1) < 0.6e-3
+        moved.append((coat.positions - pressed.surface.coat.positions)[0, under].mean(axis=0))
+        force.append(state.shear_force[0])
+        assert state.depth[0] == pytest.approx(0.5e-3, abs=2e-6)
+    np.testing.assert_allclose(moved[0][:2], (0.0, RADIUS * angle), atol=0.06 * RADIUS * angle)
+    assert np.abs(moved[1][:2]).max() < 0.06 * RADIUS * angle
+    # Mindlin's 8 G a / (2 − ν) and a sheared layer's G A / h, a = 1.6 mm.
+    assert force[0][1] == pytest.approx(1.5e3 * RADIUS * angle, rel=0.15)
+    assert np.hypot(*force[1]) < 0.1 * np.hypot(*force[0])
+
+
+def test_an_object_is_not_tilted_farther_than_its_surface_was_made_for():
+    pad = soft(press(indent(0.4e-3), StageSpec("tilt", tilt=(0.03, 0.04)), kind="cylinder"))
+    with pytest.raises(InputError, match="tilt farther"):
+        next(pad.follow(StageSpec("tilt", tilt=(0.0, 0.06))))
 
 
 @pytest.fixture(scope="module")

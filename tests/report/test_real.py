@@ -157,6 +157,13 @@ def of_itself(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarra
 ONE_ROUND = ["--sides", "own", "--starts", "1", "--rounds", "1", "--prior", "tied", "--device", "cpu"]
 
 
+@pytest.fixture
+def fewer_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A third of the steps that a fit may take: one that begins where the light comes from is near its end by then."""
+    monkeypatch.setattr("raytac.calibrate.ray_fit.FIRST", 30)
+
+
+@pytest.mark.usefixtures("fewer_steps")
 def test_calibrate_writes_a_sensor_that_needs_no_photograph(of_itself: tuple[Path, np.ndarray], tmp_path: Path) -> None:
     """What is written renders fitted presses, and others, to about a level, wherever the folder is copied."""
     (data, background), made = of_itself, tmp_path / "made"
@@ -191,6 +198,7 @@ def test_calibrate_writes_a_sensor_that_needs_no_photograph(of_itself: tuple[Pat
     assert off.mean() < 0.5 and off.max() <= 8, (off.mean(), off.max())
 
 
+@pytest.mark.usefixtures("fewer_steps")
 def test_photographs_of_ones_own_become_a_sensor(
     of_itself: tuple[Path, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

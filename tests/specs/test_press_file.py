@@ -101,7 +101,7 @@ ERRORS: list[tuple[str, str, Any, str]] = [
         "coin",
         "trajectory[0].kind",
         "indnt",
-        "must be a known name; did you mean 'indent'? choose from: indent, shear, twist, release",
+        "must be a known name; did you mean 'indent'? choose from: indent, shear, twist, tilt, release",
     ),
     ("coin", "trajectory[0].depth_mm", -0.5, "must be a number in (0, 50] mm"),
     ("coin", "trajectory[0].duration_s", 0.0, "must be a number in (0, 60] s"),
@@ -161,10 +161,10 @@ def test_a_key_of_another_kind_is_unknown(make_press: MakePress) -> None:
         load_press(make_press("sphere", {"trajectry": []}))
 
 
-@pytest.mark.parametrize("kind", ["shear", "twist", "release"])
+@pytest.mark.parametrize("kind", ["shear", "twist", "tilt", "release"])
 def test_only_an_indent_can_come_first_or_after_a_release(make_press: MakePress, kind: str) -> None:
     stage: dict[str, Any] = {"kind": kind, **({"shear_mm": [0.1, 0.0]} if kind == "shear" else {})}
-    stage |= {"twist_deg": 5.0} if kind == "twist" else {}
+    stage |= {"twist_deg": 5.0} if kind == "twist" else {"tilt_deg": [5.0, -1.0]} if kind == "tilt" else {}
     indent = {"kind": "indent", "depth_mm": 0.5}
     for stages, index in (([stage, indent], 0), ([indent, {"kind": "release"}, stage], 2)):
         path = make_press("torus", {"trajectory": stages})

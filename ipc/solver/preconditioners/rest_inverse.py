@@ -80,7 +80,10 @@ def multiply_vectors(
 
 @wp.kernel
 def place_running(running: IntArray, threads: wp.int32, place: IntArray, total_running: IntArray):
-    """Numbers the running environments, so that products have no gaps; −1 for others. One block of threads."""
+    """Numbers the running environments, so that products have no gaps; −1 for others.
+
+    One block of threads.
+    """
     lane = wp.tid()
     before = wp.int32(0)
     for first in range(0, running.shape[0], threads):

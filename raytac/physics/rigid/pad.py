@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Unpack
 
 import numpy as np
@@ -12,10 +12,9 @@ from raytac.gel.pyramid import ElasticSurround
 from raytac.gel.surface import GelSurface
 from raytac.gel.traction import foundation_traction
 from raytac.physics.base import PadReading
-from raytac.physics.press import CLEARANCE, PressPad, PressSettings
+from raytac.physics.press import CLEARANCE, TURNS, PressPad, PressSettings, turn_rotations
 from raytac.physics.rigid.load_law import LoadLaw, first_touch
 from raytac.physics.rigid.rig import PressRig
-from raytac.se3 import about_z
 from raytac.shapes.underside import object_height
 from raytac.specs.press import DYNAMICS, PressScene, StageSpec
 from raytac.specs.sensor import SensorSpec
@@ -26,15 +25,18 @@ class _Environment:
     """State of one environment between stages."""
 
     origin: np.ndarray
-    """Pad-frame position of the object's origin at first touch, zero shear and twist (3,) [m]."""
+    """Pad-frame position of the object's origin at first touch, zero shear and turn (3,) [m]."""
     rig: PressRig
     depth: float = -CLEARANCE
     force: float = 0.0
     by_force: bool = False
     shear: np.ndarray | None = None
-    twist: float = 0.0
-    stuck_shear: np.ndarray | None = None
-    """Shear at which the contact carries no tangential force; None out of contact."""
+    turn: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    """As of ``turn_rotations`` [rad]."""
+    slid: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    """Path along x and y of the object's matter at the contact [m]; 0 for a ball that rolls."""
+    stuck_slid: np.ndarray | None = None
+    """``slid`` at which the contact carries no tangential force; None out of contact."""
     stuck_twist: float = 0.0
     failed: bool = False
 
@@ -105,7 +107,7 @@ class RigidPad(PressPad):
         if self.targets.lost[b]:
             return _Environment(np.full(3, np.nan), self._rig(1.0), failed=True)
         try:
-            touch, law = self._touch(b, x, y, 0.0)
+            touch, law = self._touch(b, x, y, np.zeros(3))
         except InputError as error:
             raise self.targets.start_error(b, error) from error
         stiffest = law.stiffest(max((stage.force or 0.0 for stage in self.scene.trajectory), default=0.0))
@@ -117,10 +119,10 @@ class RigidPad(PressPad):
     def _rig(self, stiffest: float) -> PressRig:
         return PressRig(self.scene.object.mass, stiffest, self.scene.moves)
 
-    def _touch(self, b: int, x: float, y: float, twist: float) -> tuple[float, LoadLaw]:
-        """First-touch height of the object's origin and load law at a place and angle; cached."""
+    def _touch(self, b: int, x: float, y: float, turn: np.ndarray) -> tuple[float, LoadLaw]:
+        """First-touch height of the object's origin and load law at a place and turn; cached."""
         pose = np.eye(4)
-        pose[:3, :3] = about_z(twist) @ self.targets.rotations[b]
+        pose[:3, :3] = turn_rotations(turn) @ self.targets.rotations[b]
         pose[:2, 3] = x, y
         key = pose.tobytes()
         if key not in self._touches:
@@ -136,16 +138,20 @@ class RigidPad(PressPad):
         stage = self.targets.stage(stage, b)
         previous_force = e.force
         assert e.shear is not None
-        shear, twist = e.shear, e.twist
+        shear, turn = e.shear, e.turn
         if stage.kind == "shear":
             shear = old.shear + fraction * (np.asarray(stage.shear, float) - old.shear)
-        elif stage.kind == "twist":
-            twist = old.twist + fraction * (stage.twist - old.twist)
+        elif stage.kind in TURNS:
+            end = (*old.turn[:2], stage.twist) if stage.kind == "twist" else (*stage.tilt, old.turn[2])
+            turn = old.turn + fraction * (np.array(end) - old.turn)
         try:
-            touch, law = self._touch(b, e.origin[0] + shear[0], e.origin[1] + shear[1], twist)
+            touch, law = self._touch(b, e.origin[0] + shear[0], e.origin[1] + shear[1], turn)
         except InputError as error:
             raise self.targets.stage_error(index, stage, b, error) from error
-        e.shear, e.twist = shear, twist
+        # The matter that touches is below the origin, at about the height of first touch.
+        tilted = turn_rotations(np.array([0.0, 0.0, turn[2]]))[:2, :2] @ (turn - e.turn)[:2]
+        e.slid = e.slid + shear - e.shear + touch * np.array([-tilted[1], tilted[0]])
+        e.shear, e.turn = shear, turn
         if stage.kind == "indent":
             e.by_force = stage.force is not None
         e.rig.place(e.origin, touch)
@@ -165,12 +171,12 @@ class RigidPad(PressPad):
                 law.depth_at(target)
             except InputError as error:
                 raise self.targets.stage_error(index, stage, b, error) from error
-            e.rig.joints = np.array([*e.shear, -max(e.depth, lift), e.twist])
+            e.rig.joints = np.array([*e.shear, -max(e.depth, lift), e.turn[2]])
             settled = e.rig.load(previous_force, target, stage.duration / steps, law.secant_stiffness)
             e.failed = not settled
             e.depth = -float(e.rig.joints[2])
         if not e.failed:
-            e.force = e.rig.hold(np.array([*e.shear, -e.depth, e.twist]), law.secant_stiffness)
+            e.force = e.rig.hold(np.array([*e.shear, -e.depth, e.turn[2]]), law.secant_stiffness)
             e.failed = not np.isfinite(e.force)
         self._stick(b, e)
 
@@ -178,20 +184,20 @@ class RigidPad(PressPad):
         """Let the contact slip where the gel's elastic shear or twist would exceed Coulomb's limit."""
         assert e.shear is not None
         if e.force <= 0.0 or e.failed:
-            e.stuck_shear = None
+            e.stuck_slid = None
             return
-        if e.stuck_shear is None:
-            e.stuck_shear, e.stuck_twist = e.shear.copy(), e.twist
-        _, law = self._touch(b, e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.twist)
-        stretch, angle = e.shear - e.stuck_shear, e.twist - e.stuck_twist
+        if e.stuck_slid is None:
+            e.stuck_slid, e.stuck_twist = e.slid.copy(), e.turn[2]
+        _, law = self._touch(b, e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.turn)
+        stretch, angle = e.slid - e.stuck_slid, e.turn[2] - e.stuck_twist
         limit = self.sensor.gelpad.friction * e.force
         longest = limit / law.shear_stiffness(e.rig.depth)
         length = float(np.hypot(*stretch))
         if length > longest:
-            e.stuck_shear = e.shear - stretch * (longest / length)
+            e.stuck_slid = e.slid - stretch * (longest / length)
         widest = 3.0 * np.pi / 16.0 * limit * law.contact_radius(e.rig.depth) / law.twist_stiffness(e.rig.depth)
         if abs(angle) > widest:
-            e.stuck_twist = e.twist - np.sign(angle) * widest
+            e.stuck_twist = e.turn[2] - np.sign(angle) * widest
 
     def _present(self) -> PadReading:
         batch, environments = self.num_envs, self._environments
@@ -199,16 +205,19 @@ class RigidPad(PressPad):
         depth, torque, area = np.zeros((3, batch))
         force = np.zeros((batch, 3))
         failed = np.zeros(batch, bool)
-        turns = np.tile(np.eye(4), (batch, 1, 1))
-        turns[:, :3, :3] = self.targets.rotations
         for b, e in enumerate(environments):
-            pose[b], case[b] = e.rig.pad_from_object @ turns[b], e.rig.world_from_pad
+            pose[b], case[b] = e.rig.pad_from_object, e.rig.world_from_pad
+            tilt = turn_rotations(e.turn * (1.0, 1.0, 0.0))
+            pose[b, :3, :3] = pose[b, :3, :3] @ tilt @ self.targets.rotations[b]
+            if self.scene.moves == "case" and e.turn[:2].any():
+                case[b, :3, :3] = tilt.T @ case[b, :3, :3]
+                case[b, :3, 3] = e.origin + tilt.T @ (case[b, :3, 3] - e.origin)
             depth[b], force[b, 2] = e.depth, -e.force
-            if e.stuck_shear is not None and e.shear is not None:
-                _, law = self._touch(b, e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.twist)
-                force[b, :2] = law.shear_stiffness(e.rig.depth) * (e.shear - e.stuck_shear)
+            if e.stuck_slid is not None and e.shear is not None:
+                _, law = self._touch(b, e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.turn)
+                force[b, :2] = law.shear_stiffness(e.rig.depth) * (e.slid - e.stuck_slid)
                 area[b] = law.contact_area(e.rig.depth)
-                torque[b] = law.twist_stiffness(e.rig.depth) * (e.twist - e.stuck_twist)
+                torque[b] = law.twist_stiffness(e.rig.depth) * (e.turn[2] - e.stuck_twist)
             if e.failed:
                 failed[b] = True
                 for array in (pose, case, depth, force, torque, area):

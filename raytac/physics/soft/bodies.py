@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -150,6 +151,7 @@ def object_body(
     weight: float = 0.0,
     edge_length: float = 1e-3,
     lowest: float = 0.0,
+    tilt: float = 0.0,
     sag: float = SAG,
 ) -> SceneBody:
     """The object of a press scene as a body of the solver, in the object's frame.
@@ -165,6 +167,7 @@ def object_body(
         weight, edge_length: of an affine body [N]; of a soft body's tetrahedra [m].
         sag: greatest distance of facets inside a curved part [m].
         lowest: height above the object's lowest point [m] beyond which a kinematic body's triangles are left out; 0 keeps all.
+        tilt: greatest angle about a horizontal axis through the origin [rad], at which the same must hold.
 
     Raises:
         InputError: an unknown kind of body, or a surface that it cannot be made from or that crosses itself.
@@ -172,6 +175,8 @@ def object_body(
     surface = _checked_surface(OBJECT, parts, sag)
     if spec.dynamics == "kinematic":
         if lowest > 0.0:
+            # A tilt by α lowers one point against another by at most sin α times their distance.
+            lowest += 2.0 * math.sin(tilt) * float(np.linalg.norm(surface.vertices, axis=1).max())
             heights = (surface.vertices @ row for row in rotations[:, 2])
             near = np.any([height[surface.faces].min(axis=1) - height.min() <= lowest for height in heights], axis=0)
             used, faces = np.unique(surface.faces[near], return_inverse=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import cached_property
 from typing import Unpack
@@ -34,7 +35,7 @@ class SoftPad(PressPad):
 
     Between readings the solver takes as many steps as it needs. An ``indent`` to a depth ends when the *coat* is at that depth:
     the barrier's clearance is added to the object's height; on the way the coat is there within some micrometres, and never deeper than
-    the stage's end; in a shear or twist that follows, it stays there. A free object is laid down and comes to rest.
+    the stage's end; in a shear, twist or tilt that follows, it stays there. A free object is laid down and comes to rest.
 
     The ``pad_from_object`` of a reading is where the object is shown: lowered by the barrier's clearance, so that it touches.
 
@@ -76,7 +77,7 @@ class SoftPad(PressPad):
         if self.parts:
             self._places = PressPlacement(scene, self.parts, sensor.gelpad, self.grid, self.targets)
             above = self._places.poses(
-                np.full(self.num_envs, self.mesh.d_hat + CLEARANCE), np.zeros((self.num_envs, 2)), np.zeros(self.num_envs)
+                np.full(self.num_envs, self.mesh.d_hat + CLEARANCE), np.zeros((self.num_envs, 2)), np.zeros((self.num_envs, 3))
             )
             self.solver = PressSolver(sensor, self.mesh, self._body(), above, device, control)
             self._drive = PressController(scene, self.solver, self._reader, self._places, self.targets)
@@ -92,10 +93,13 @@ class SoftPad(PressPad):
     def follow(self, stage: StageSpec, steps: int = 1) -> Iterator[PadReading]:
         """Readings along one more stage, as of ``PressPad``.
 
-        Raises ``InputError``: also for a stage deeper than any of the scene's: there the object's surface was left out.
+        Raises ``InputError``: also for a stage deeper, or tilted farther, than any of the scene's: there the object's surface was left out.
         """
         if stage.kind == "indent" and (stage.depth or self.sensor.gelpad.thickness) > self._deepest:
             rule = f"must not go deeper than the scene's deepest stage, {self._deepest * 1e3:.4g} mm (a force may go as deep as the pad)"
+            raise InputError("stage", value=stage, rule=rule)
+        if math.hypot(*stage.tilt) > self._widest + 1e-12:
+            rule = f"must not tilt farther than any of the scene's stages, {math.degrees(self._widest):.4g}°"
             raise InputError("stage", value=stage, rule=rule)
         yield from super().follow(stage, steps)
 
@@ -161,11 +165,17 @@ class SoftPad(PressPad):
         depths = self.targets.depths
         return deepest if depths is None else max(deepest, float(np.nanmax(depths, initial=0.0)))
 
+    @property
+    def _widest(self) -> float:
+        """Tilt that the object's surface was made for [rad]."""
+        return max((math.hypot(*stage.tilt) for stage in self.scene.trajectory), default=0.0)
+
     def _body(self):
         settings = {
             "weight": max((stage.force or 0.0 for stage in self.scene.trajectory), default=0.0),
             "edge_length": 0.75 * float(np.diff(self.mesh.coat.lines_x).mean()),
             "lowest": self._deepest + float(np.ptp(self.grid.rest)) + CLEARANCE,
+            "tilt": self._widest,
             "sag": _SAG * self.mesh.d_hat,
         }
         try:

@@ -1,11 +1,11 @@
-"""Controller of a soft press: depth or normal force, shear, twist and release."""
+"""Controller of a soft press: depth or normal force, shear, twist, tilt and release."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from raytac.io.progress import Progress
-from raytac.physics.press import CLEARANCE, PressTargets
+from raytac.physics.press import CLEARANCE, TURNS, PressTargets
 from raytac.physics.soft.placement import PressPlacement
 from raytac.physics.soft.press_solver import PressSolver
 from raytac.physics.soft.reading import SoftReader
@@ -40,28 +40,28 @@ class PressController:
     def begin(self) -> None:
         """Begin a stage where the object is now, at the prescribed force, or else the present one."""
         present = np.maximum(np.nan_to_num(self._solver.normal_force()), 0.0)
-        self._start = self._depth.copy(), self._shear.copy(), self._twist.copy()
+        self._start = self._depth.copy(), self._shear.copy(), self._turn.copy()
         self._start_force = np.where(np.isfinite(self._force), self._force, present)
 
     def poses(self) -> np.ndarray:
         """Prescribed ``pad_from_object`` (B, 4, 4): higher than the depth by the clearance."""
-        return self._placement.poses(self._clearance - self._depth, self._shear, self._twist)
+        return self._placement.poses(self._clearance - self._depth, self._shear, self._turn)
 
     def case(self) -> np.ndarray | None:
         """``world_from_pad`` (B, 4, 4) if the case moves."""
         if self._scene.moves != "case":
             return None
-        return self._placement.case(self._clearance - self._depth, self._shear, self._twist)
+        return self._placement.case(self._clearance - self._depth, self._shear, self._turn)
 
     def advance(self, stage: StageSpec, fraction: float) -> None:
         """Move from the present position to a ``fraction`` of the stage that was begun last."""
-        depth, shear, twist = self._start
-        if stage.kind in ("shear", "twist"):
+        depth, shear, turn = self._start
+        if stage.kind in ("shear", *TURNS):
             if stage.kind == "shear":
-                shear, twist = shear + fraction * (self._targets.shear(stage) - shear), self._twist
+                shear, turn = shear + fraction * (self._targets.shear(stage) - shear), self._turn
             else:
-                shear, twist = self._shear, twist + fraction * (self._targets.twist(stage) - twist)
-            self._move(self._depth, shear, twist, follow=True)
+                shear, turn = self._shear, turn + fraction * (self._targets.turn(stage, turn) - turn)
+            self._move(self._depth, shear, turn, follow=True)
             if not np.isfinite(self._force).any():
                 self._settle_depth()  # a shear unloads what lies behind the object
         elif stage.kind == "release":
@@ -79,7 +79,7 @@ class PressController:
     def _clear(self) -> None:
         batch = self.num_envs
         self._depth = np.full(batch, -CLEARANCE)
-        self._shear, self._twist = np.zeros((batch, 2)), np.zeros(batch)
+        self._shear, self._turn = np.zeros((batch, 2)), np.zeros((batch, 3))
         self._force = np.full(batch, np.nan)
         """Prescribed normal force [N]; NaN while a depth is prescribed."""
         self._clearance = np.full(batch, self._d_hat)
@@ -98,7 +98,7 @@ class PressController:
         self._clearance = self._clearance + np.clip(error, -self._d_hat, 0.5 * np.abs(travel))
         exact = np.full(self.num_envs, is_last) | np.isnan(self.measured)  # at the first touch no clearance is known yet
         margin = np.where(exact, np.clip(travel, 0.0, self._d_hat), 0.0)
-        self._move(depth - margin, self._shear, self._twist)
+        self._move(depth - margin, self._shear, self._turn)
         if exact.any():
             before = self._clearance
             self._clearance = before + np.nan_to_num(self._clearance_error())
@@ -107,7 +107,7 @@ class PressController:
             self._settle_depth(np.minimum(before, self._clearance))
 
     def _move(
-        self, depth: np.ndarray, shear: np.ndarray, twist: np.ndarray, stretch: float = 1.0, *, follow: bool = False
+        self, depth: np.ndarray, shear: np.ndarray, turn: np.ndarray, stretch: float = 1.0, *, follow: bool = False
     ) -> None:
         """Move in a straight line, in steps of at most ``SubstepLimits.step`` times ``stretch``.
 
@@ -115,13 +115,13 @@ class PressController:
         """
         limits = self._limits
         start = np.maximum(self._depth, -self._d_hat) if stretch == 1.0 else self._depth
-        by_twist = np.abs(twist - self._twist) * (limits.step / limits.turn)
-        lengths = np.abs(depth - start), np.linalg.norm(shear - self._shear, axis=1), by_twist
+        by_turn = np.linalg.norm(turn - self._turn, axis=1) * (limits.step / limits.turn)
+        lengths = np.abs(depth - start), np.linalg.norm(shear - self._shear, axis=1), by_turn
         steps = max(int(np.ceil(max(length.max() for length in lengths) / (limits.step * stretch) - 1e-9)), 1)
-        start_shear, start_twist = self._shear, self._twist
+        start_shear, start_turn = self._shear, self._turn
         for step in range(1, steps + 1):
             share = step / steps
-            self._shear, self._twist = start_shear + share * (shear - start_shear), start_twist + share * (twist - start_twist)
+            self._shear, self._turn = start_shear + share * (shear - start_shear), start_turn + share * (turn - start_turn)
             self._depth = start + share * (depth - start)
             self._step()
             if np.isfinite(self._force).any():
@@ -180,13 +180,13 @@ class PressController:
             self._step()
 
     def _release(self, depth: np.ndarray, fraction: float) -> None:
-        lift = self._placement.touch_drop(self._shear, self._twist)
+        lift = self._placement.touch_drop(self._shear, self._turn)
         if self._is_free:
             if fraction == 1.0:
                 self._solver.reset()
                 self._depth = lift - CLEARANCE
             return
-        self._move(depth + fraction * (lift - CLEARANCE - depth), self._shear, self._twist, self._control.release_stretch)
+        self._move(depth + fraction * (lift - CLEARANCE - depth), self._shear, self._turn, self._control.release_stretch)
 
     def _load(self) -> None:
         """Reach the normal force: a free object by its weight, a driven one by a secant search."""
@@ -197,7 +197,7 @@ class PressController:
         self._depth = np.maximum(self._depth, -self._d_hat)
         if not np.isfinite(self._stiffness).all():
             target = np.nan_to_num(self._force)
-            self._stiffness = np.array([self._placement.stiffness(b, self._twist[b], target[b]) for b in range(self.num_envs)])
+            self._stiffness = np.array([self._placement.stiffness(b, self._turn[b], target[b]) for b in range(self.num_envs)])
         force, drift = self._solver.normal_force(), np.zeros(self.num_envs)
         for _ in range(control.force_steps):
             error = self._force_error()
