@@ -19,6 +19,7 @@ import hashlib
 import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -212,12 +213,12 @@ class BounceField:
         z, n = here.x, mi.Vector3f(here.y, here.z, here.w)
         area = g.dx * g.dy / np.pi
 
-        def add(ox: Any, oy: Any, v: list[Any]) -> tuple[Any, Any, list[Any]]:
+        def add(oy: int, ox: Any, v: list[Any]) -> tuple[Any, list[Any]]:
             jx, jy = mi.Int32(ix) + ox, mi.Int32(iy) + oy
             ok = (jx >= 0) & (jx < g.nx) & (jy >= 0) & (jy < g.ny)
             j = mi.UInt32((mi.Int32(env) * g.ny + jy) * g.nx + jx)
             q = dr.gather(mi.Vector4f, patches, j, ok)
-            d = mi.Vector3f(mi.Float(ox) * g.dx, mi.Float(oy) * g.dy, q.x - z)
+            d = mi.Vector3f(mi.Float(ox) * g.dx, oy * g.dy, q.x - z)
             r2 = dr.maximum(dr.squared_norm(d), 1e-12)
             cos_i = dr.dot(n, d)
             cos_j = -(q.y * d.x + q.z * d.y + q.w * d.z)
@@ -228,14 +229,14 @@ class BounceField:
                 light = dr.gather(mi.Vector4f, packet, j, ok)
                 for c in range(len(out[4 * m : 4 * m + 4])):
                     out[4 * m + c] = out[4 * m + c] + d * (weight * light[c])
-            # Row by row through a disc; the patch itself is among them and gives nothing.
-            ends = (ox + 1) * (ox + 1) + oy * oy > REACH**2
-            following = dr.select(ends, oy + 1, oy)
-            first = -mi.Int32(dr.sqrt(mi.Float(dr.maximum(REACH**2 - following * following, 0))))
-            return dr.select(ends, first, ox + 1), following, out
+            return ox + 1, out
 
-        start = (mi.Int32(0), mi.Int32(-REACH), [dr.zeros(mi.Vector3f, dr.width(i)) for _ in parts])
-        *_, gathered = dr.while_loop(start, lambda ox, oy, v: oy <= REACH, add, label="coat bounce")
+        # Row by row through a disc; the patch itself is among them and gives nothing.
+        gathered = [dr.zeros(mi.Vector3f, dr.width(i)) for _ in parts]
+        for oy in range(-REACH, REACH + 1):
+            half = int(np.sqrt(REACH**2 - oy**2))
+            row = partial(add, oy)
+            _, gathered = dr.while_loop((mi.Int32(-half), gathered), partial(_up_to, half), row, label="coat bounce")
         node = i - env * (g.nx * g.ny)
         result = []
         for (_, places), v in zip(parts, gathered, strict=True):
@@ -258,3 +259,7 @@ class BounceField:
         fields = (bilinear(view.corners(mi.Vector4f, grid, i), wx, wy) for grid in grids)
         channels = [channel for channel, _ in self.parts(by_layer)]
         return [(c, dr.maximum(e.x + n.x * e.y + n.y * e.z + n.z * e.w, 0)) for c, e in zip(channels, fields, strict=True)]
+
+
+def _up_to(last: int, ox: Any, v: list[Any]) -> Any:
+    return ox <= last

@@ -27,7 +27,7 @@ from raytac.physics.soft.mesh import PadMesh
 from raytac.physics.soft.settings import DEFAULT_CORRECTION, Correction
 from raytac.physics.soft.undersides import Undersides
 from raytac.specs.sensor import GelpadSpec
-from raytac.warp_runtime import LAUNCH, Recorded, start_warp
+from raytac.warp_runtime import LAUNCH, HostArrays, Recorded, start_warp
 
 _SAMPLE = 0.2e-3
 """Spacing of the samples at which the clearance is measured [m]."""
@@ -123,12 +123,12 @@ class SoftReader:
 
     def read(self, state: CoatState, failed: np.ndarray) -> SoftReading:
         """Surface, contact and forces of every pad, copied; NaN where ``failed`` (B,) or not finite."""
-        device: Any = state.vertices.device
-        shown = self.launch(state, wp.array(failed, dtype=wp.bool, device=device))
-        failed, clearance, residual, centre = map(_copied, (shown.failed, shown.clearance, shown.residual, shown.centre))
-        coat, vertices, forces = map(_copied, (shown.coat, shown.vertices, shown.forces))
-        height, contact, underside = map(_copied, (shown.height, shown.contact, shown.underside))
-        poses, touching = _copied(state.objects.poses), _copied(state.objects.touching)
+        with LAUNCH:
+            batch = self._batch(state)
+            batch.leave_out(failed)
+            batch.read(state)
+            failed, clearance, residual, centre, coat, vertices, forces, *on_grid, poses, touching = batch.copies(state)
+        height, contact, underside = on_grid
         poses[:, :, 2, 3] -= np.nan_to_num(clearance)[:, None]
         for values in (vertices, forces, poses):
             values[failed] = np.nan
@@ -180,10 +180,6 @@ class SoftReader:
         return correction_compliances(self.mesh, self._gelpad)
 
 
-def _copied(array: wp.array) -> np.ndarray:
-    return array.numpy().copy()
-
-
 class _Batch:
     """Arrays and kernels of a reader for B pads of one device.
 
@@ -213,6 +209,8 @@ class _Batch:
         self._single_rest = self._on_device(grid.rest[None].astype(np.float32), wp.float32)
         self._coat, self._centre = self._zeros(num_envs, vertices, dtype=wp.vec3d), self._zeros(num_envs, dtype=wp.vec2d)
         self.unread = self._zeros(num_envs, dtype=wp.bool)
+        self._unread = HostArrays(self.unread)
+        self._host: tuple[CoatState, HostArrays] | None = None
         self._measured, self._shown = (_Repeated(f, self._device) for f in (self._launch_clearance, self._launch_all))
         self._residual, self._failed = self._zeros(num_envs, dtype=wp.float64), self._zeros(num_envs, dtype=wp.bool)
 
@@ -223,6 +221,20 @@ class _Batch:
     def read(self, state: CoatState) -> PadArrays:
         """Show a state, but for the environments ``unread``."""
         return self._shown(state)
+
+    def leave_out(self, failed: np.ndarray) -> None:
+        """Read all but ``failed`` (B,) from now on."""
+        self._unread.values[0][:] = failed
+        self._unread.write()
+
+    def copies(self, state: CoatState) -> list[np.ndarray]:
+        """What ``read`` has shown of a state, and its objects' poses and which of them touch, in NumPy."""
+        if self._host is None or self._host[0] is not state:
+            shown = self._shown.result
+            numbers = shown.failed, shown.clearance, shown.residual, shown.centre, shown.coat, shown.vertices, shown.forces
+            fields = shown.height, shown.contact, shown.underside
+            self._host = state, HostArrays(*numbers, *fields, state.objects.poses, state.objects.touching)
+        return [values.copy() for values in self._host[1].read()]
 
     def _launch_clearance(self, state: CoatState) -> wp.array:
         self._find_sound(state, self._none_failed)
@@ -327,20 +339,21 @@ class _Batch:
 
 
 class _Repeated:
-    """Launches for a state: one by one, and from the second time on for the same state as one recording."""
+    """Launches for a state, which are one recording from the second time on."""
 
     def __init__(self, launch: Callable[[CoatState], Any], device: Any) -> None:
         """``launch``: returns the same arrays every time."""
         self._launch, self._device = launch, device
         self._state: CoatState | None = None
         self._recorded: Recorded | None = None
-        self._result: Any = None
+        self.result: Any = None
+        """What the last launch returned."""
 
     def __call__(self, state: CoatState) -> Any:
         if self._state is not state:
-            self._state, self._recorded, self._result = state, None, self._launch(state)
+            self._state, self._recorded, self.result = state, None, self._launch(state)
         else:
             if self._recorded is None:
                 self._recorded = Recorded(partial(self._launch, state), device=self._device)
             self._recorded()
-        return self._result
+        return self.result

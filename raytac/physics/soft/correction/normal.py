@@ -69,7 +69,8 @@ class NormalCorrection:
     The pressure is solved for by conjugate gradients over the nodes in contact, which are revised in every step (I. A. Polonsky and
     L. M. Keer, A numerical method for solving rough contact problems, Wear 231, 1999), with a preconditioner: g is their gap, z the
     preconditioned gap, t the direction, G = g·z, τ the step length. z is local and grows with wave number, as A falls: A falls as 1/k.
-    In units of the grid c + k² (c − the five-point Laplacian) times that varies by 7 where 1/k varies by 200.
+    In units of the grid c + k² (c − the five-point Laplacian) times that varies by 7 where 1/k varies by 200. A step that takes the
+    pressure of no node to 0 and adds none changes A p by τ A t, which is known.
 
     Attributes of the last ``solve``:
         load: normal force on the vertices [N], (B, V), float64.
@@ -110,7 +111,7 @@ class NormalCorrection:
         border_y, border_x = SplineAxis(mesh.lines_y).matrix(grid.y), SplineAxis(mesh.lines_x).matrix(grid.x)
         self._border, self._border_x = (constant(border_y.T), constant(border_x)), constant(border_x.T)
         zeros, (rows, columns) = products.zeros, mesh.shape
-        self._along_y, self._convolved, self._dent = zeros(nx, ny), zeros(nx, ny), zeros(nx, ny)
+        self._along_y, self._convolved, self._dent, self._response = (zeros(nx, ny) for _ in range(4))
         self.dent = zeros(ny, nx)
         self._over_x, self._over_vertices, self._border_y = zeros(ny, columns), zeros(rows, columns), zeros(columns, ny)
         self._border_at = zeros(columns, rows)
@@ -131,7 +132,7 @@ class NormalCorrection:
         self._remainder = wp.zeros((count, 1, vertices), dtype=wp.float64, device=device)
         self._near = wp.zeros((count, shape[0]), dtype=wp.vec2i, device=device)
         self._sums, self._gaps = (wp.zeros((count, shape[0]), dtype=wp.vec3d, device=device) for _ in range(2))
-        self._overlapping = wp.zeros((count, shape[0]), dtype=wp.int32, device=device)
+        self._overlapping, self._bent = (wp.zeros((count, shape[0]), dtype=wp.int32, device=device) for _ in range(2))
         self._greatest, self._go = wp.zeros(count, dtype=wp.float32, device=device), wp.zeros(1, dtype=wp.int32, device=device)
         search: Any = kernels.Search()
         for name, dtype in _SEARCH.items():
@@ -182,30 +183,32 @@ class NormalCorrection:
         """Launch one step of the search for the pressure."""
         s, lines, count = self.search, self._near.shape, len(self._greatest)
         p, t, g, z = (one.numbers for one in (self._p, self._t, self._g, self._z))
-        dent = self._dent.numbers.transpose((0, 2, 1))
-        self._find_dent(self._p)
+        dent, response = (one.numbers.transpose((0, 2, 1)) for one in (self._dent, self._response))
+        self._find_dent(self._p, self._dent, s.stale)
         self._launch(kernels.gaps, lines, [s, dent, self._overlap.numbers, p, g, self._gaps])
         self._launch(kernels.stiffen, lines, [s, _SHORTEST, g, p, z, self._sums])
         self._launch(kernels.judge, count, [s, self._gaps, self._sums, self._overlapping, self.settings.gap_tolerance])
         self._launch(kernels.turn, lines, [s, z, p, self.pressure.numbers, t])
-        self._find_dent(self._t)
-        self._launch(kernels.curvatures, lines, [s, dent, g, p, t, self._sums])
+        self._find_dent(self._t, self._response, s.active)
+        self._launch(kernels.curvatures, lines, [s, response, g, p, t, self._sums])
         self._launch(kernels.put, 1, [0, self._go])
         self._launch(kernels.choose_length, count, [s, self._sums, self.settings.normal_iterations, self._go])
-        self._launch(kernels.move, lines, [s, _SHORTEST, g, t, p, self._overlapping])
+        self._launch(kernels.move, lines, [s, _SHORTEST, g, t, p, self._overlapping, self._bent])
+        self._launch(kernels.choose_stale, count, [s, self._bent])
+        self._launch(kernels.follow_step, lines, [s, response, dent])
 
-    def _find_dent(self, pressure: Matrices) -> None:
-        """Launch the dent under a pressure within the windows, by column and row."""
+    def _find_dent(self, pressure: Matrices, out: Matrices, active: wp.array) -> None:
+        """Launch the dent under a pressure where ``active`` (B,), in the windows by column and row."""
         s, multiply = self.search, self.products.multiply
-        window: Any = {"rows": s.columns, "active": s.active}
+        window: Any = {"rows": s.columns, "active": active}
         multiply(pressure.transposed, self._across[0], self._along_y, inner=s.rows, **window)
         dim = self.products.blocks(self._along_y)
-        inputs = [s.active, s.columns, self._table, self._along_y.packets, len(self.x), dim[2], self._convolved.packets]
+        inputs = [active, s.columns, self._table, self._along_y.packets, len(self.x), dim[2], self._convolved.packets]
         self._launch(kernels.convolve, dim, inputs)
-        multiply(self._convolved, self._across[1], self._dent, columns=s.rows, **window)
-        self._find_border(pressure, s.active)
-        multiply(self._border_at, self._border[0], self._border_y, columns=s.rows, active=s.active)
-        multiply(self._border[1], self._border_y, self._dent, columns=s.rows, adds=True, **window)
+        multiply(self._convolved, self._across[1], out, columns=s.rows, **window)
+        self._find_border(pressure, active)
+        multiply(self._border_at, self._border[0], self._border_y, columns=s.rows, active=active)
+        multiply(self._border[1], self._border_y, out, columns=s.rows, adds=True, **window)
 
     def _find_border(self, pressure: Matrices, active: wp.array) -> None:
         """Launch what the pad's free sides add: ``forces`` and the dent at the vertices."""
@@ -246,7 +249,7 @@ class NormalCorrection:
 
 _SEARCH = {
     "active": wp.int32, "touched": wp.int32, "rows": wp.vec2i, "columns": wp.vec2i, "last": wp.float64, "beta": wp.float32,
-    "tau": wp.float32, "best": wp.float64, "improved": wp.int32, "count": wp.int32,
+    "tau": wp.float32, "best": wp.float64, "improved": wp.int32, "count": wp.int32, "stale": wp.int32,
 }  # fmt: skip
 _SHORTEST = 0.5
 """c of the preconditioner, in units of the grid.

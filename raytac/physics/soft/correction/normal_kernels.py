@@ -46,6 +46,8 @@ class Search:
     improved: wp.array(dtype=wp.int32)
     """1 if this step has it."""
     count: wp.array(dtype=wp.int32)
+    stale: wp.array(dtype=wp.int32)
+    """1 if the dent does not follow from that of the step before."""
 
 
 @wp.kernel
@@ -163,6 +165,7 @@ def choose_windows(
     s.best[env] = _HUGE
     s.improved[env] = 0
     s.count[env] = 0
+    s.stale[env] = active
 
 
 @wp.kernel
@@ -400,24 +403,55 @@ def move(
     # outputs
     p: wp.array3d(dtype=wp.float32),
     overlapping: wp.array2d(dtype=wp.int32),
+    bent: wp.array2d(dtype=wp.int32),
 ):  # fmt: skip
-    """Step of the pressure along a row; 1 where a node without pressure overlaps the object."""
+    """Step of the pressure along a row; 1 where a node without pressure overlaps the object.
+
+    ``bent``: 1 where the step is not τ t at every node.
+    """
     env, row = wp.tid()
     columns, rows = s.columns[env], s.rows[env]
     if s.active[env] == 0 or row < rows[0] or row >= rows[1]:
         return
-    tau, added = s.tau[env], wp.int32(0)
+    tau, added, cut = s.tau[env], wp.int32(0), wp.int32(0)
     i, end = wp.max(columns[0], 0), columns[1]
     while i < end:
-        value = wp.float32(0.0)
-        if p[env, row, i] > _ZERO:
-            value = wp.max(p[env, row, i] - tau * t[env, row, i], _ZERO)
+        straight = p[env, row, i] - tau * t[env, row, i]  # without pressure t is 0
+        value = wp.max(straight, _ZERO)
         if value <= _ZERO and g[env, row, i] < _ZERO:
             value = value - tau * shortest * g[env, row, i]
             added = wp.int32(1)
+        if value != straight:
+            cut = wp.int32(1)
         p[env, row, i] = value
         i += 1
     overlapping[env, row] = added
+    bent[env, row] = cut
+
+
+@wp.kernel
+def choose_stale(s: Search, bent: wp.array2d(dtype=wp.int32)):
+    """Environments whose dent is computed anew, as their last step was not τ t."""
+    env = wp.tid()
+    stale = wp.int32(0)
+    if s.active[env] != 0:
+        for row in range(s.rows[env][0], s.rows[env][1]):
+            stale = wp.max(stale, bent[env, row])
+    s.stale[env] = stale
+
+
+@wp.kernel
+def follow_step(s: Search, response: wp.array3d(dtype=wp.float32), dent: wp.array3d(dtype=wp.float32)):
+    """Dent along a row after a step of τ t, whose ``response`` is A t."""
+    env, row = wp.tid()
+    columns, rows = s.columns[env], s.rows[env]
+    if s.active[env] == 0 or s.stale[env] != 0 or row < rows[0] or row >= rows[1]:
+        return
+    tau = s.tau[env]
+    i, end = wp.max(columns[0], 0), columns[1]
+    while i < end:
+        dent[env, row, i] = dent[env, row, i] - tau * response[env, row, i]
+        i += 1
 
 
 @wp.kernel
