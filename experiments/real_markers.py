@@ -14,8 +14,8 @@ constant: a displacement that is the same for all dots (a gel that slides in its
 - ``markers.dots``, ``.lost``, ``.size_um``: dots compared and lost, root mean square of their motion; ``.ball_um``, ``.turn_deg``: of those
   under the ball; ``.detection_um``: change of the dots' motion by other thresholds of darkness, root mean square.
 - ``markers.MODEL.under_um``, ``….outside_um``: root mean square distance of dots under the ball, and of the others.
-- ``markers.layers.…`` with ``--layers``: displacement of the ball's lowest point and of its centre, its tilt, and the rings' correlation,
-  with the best motion, with the best that does not tilt, and by annulus.
+- ``markers.layers.…`` with ``--layers``: displacement of the ball's lowest point and of its centre, its tilt and turn, the correlation of
+  rings with the best motion, with the best that does not tilt, and by annulus.
 - ``markers.MODEL.constant.smooth_…_um``: what is left of that error when a smooth motion of all dots is fitted to it too, on one half of
   the dots, and is taken off the other: a turn and a scale of the whole image, an affine and a quadratic motion. What a quadratic one
   leaves is local: errors of dots, and of the model near the ball.
@@ -292,7 +292,7 @@ def main(args: Args) -> None:
             "markers.level": args.level,
         }
         if layers is not None:
-            figures = layers.figures(radius)
+            figures = layers.figures(radius) | {"turn_deg": float(np.degrees(own.turn))}
             metrics |= {f"markers.layers.{name}": value for name, value in figures.items()}
             print("layers: " + ", ".join(f"{name} {value:.4g}" for name, value in figures.items()), flush=True)
         residuals = {}
