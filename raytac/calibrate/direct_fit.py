@@ -15,6 +15,7 @@ import copy
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -169,6 +170,8 @@ class DirectFit:
         self.ties = side_ties(start.p, len(self.flat(start)))
         self.anchor, self.hold = self.flat(start), 0.0
         self.views = ViewBounds(sensor, start.p.view)
+        # Most geometries of a step have one view, and to check a camera takes longer than to trace its rays.
+        self._seen_by = lru_cache(4)(lambda distance, distortion: with_view(sensor, np.array([distance, distortion])))
 
     def with_points(self, points: tuple[EdgePoints, ...]) -> DirectFit:
         """The same problem with ``points`` on its LEDs.
@@ -207,8 +210,7 @@ class DirectFit:
         return stiff / self.sigma(state.p) ** 2
 
     def _geometry(self, state: FitState, u: np.ndarray, v: np.ndarray, press: np.ndarray) -> PixelGeometry:
-        own = with_view(self.sensor, state.p.view)
-        return pixel_geometry(own, u, v, press, state.circles, self.shots.radius, state.slopes)
+        return pixel_geometry(self._seen_by(*state.p.view), u, v, press, state.circles, self.shots.radius, state.slopes)
 
     def geometry(self, state: FitState) -> PixelGeometry:
         """Points and normals that the pixels of presses see."""
@@ -247,11 +249,16 @@ class DirectFit:
 
     def _linear(self, p: LightParameters, total: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Light [full scales] that is encoded: pressed (M, 3), at rest (K, 3); stray light (3,)."""
-        gamma, *stray, a1, a2 = p.response
+        gamma, *stray = p.response[:4]
         black = np.array(stray) * darkest(self.darkest, gamma, p.curve)
         pressed, flat, rest = total
         linear = (decode(self.behind, gamma, p.curve) - black) * pressed / flat + black
-        return linear, rest * (1 + self.r2 * (a1 + a2 * self.r2)) + black, black
+        return linear, rest * self._vignette(p) + black, black
+
+    def _vignette(self, p: LightParameters) -> np.ndarray:
+        """The vignette over the image at rest, (K, 1)."""
+        a1, a2 = p.response[4:]
+        return 1 + self.r2 * (a1 + a2 * self.r2)
 
     def lack(self, p: LightParameters, total: list[np.ndarray]) -> np.ndarray:
         """Light at rest that is below the least share, over its channel's mean, (K, 3) [levels]."""
@@ -433,8 +440,9 @@ class DirectFit:
     def _gains(self, p: LightParameters, total: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Slopes of levels by light pressed, by light at rest (negated), and of the rest image."""
         linear, rest, black = self._linear(p, total)
-        lit, still = (level_slope(light, p.response[0], p.curve) * (light - black) for light in (linear, rest))
-        return lit / total[0], lit / total[1], still / total[2]
+        slope, still = (level_slope(light, p.response[0], p.curve) for light in (linear, rest))
+        lit = slope * (linear - black)
+        return lit / total[0], lit / total[1], still * self._vignette(p)
 
     def step(self, state: FitState) -> Callable[[float], FitState]:
         """The normal equations at ``state``; the result gives the trial state of any damping."""
