@@ -15,7 +15,7 @@ constant: a displacement that is the same for all dots (a gel that slides in its
   under the ball; ``.detection_um``: change of the dots' motion by other thresholds of darkness, root mean square.
 - ``markers.MODEL.under_um``, ``….outside_um``: root mean square distance of dots under the ball, and of the others.
 - ``markers.layers.…`` with ``--layers``: displacement of the ball's lowest point and of its centre, its tilt and turn, the correlation of
-  rings with the best motion, with the best that does not tilt, and by annulus.
+  rings with the best motion, with the best that does not tilt, and by annulus; how far dots on it, ahead of its middle and behind, lag.
 - ``markers.MODEL.constant.smooth_…_um``: what is left of that error when a smooth motion of all dots is fitted to it too, on one half of
   the dots, and is taken off the other: a turn and a scale of the whole image, an affine and a quadratic motion. What a quadratic one
   leaves is local: errors of dots, and of the model near the ball.
@@ -164,15 +164,15 @@ def at_rest(sensor: SensorSpec, pixels: np.ndarray, seen: Callable[[np.ndarray],
     return np.column_stack([xy, rest_height(sensor.gelpad, *xy.T)])
 
 
-def turn_by_dots(
+def over_ball(
     sensor: SensorSpec, drag: Drag, circle: np.ndarray, centre: np.ndarray, radius: float, motion: BallMotion
-) -> float:
-    """Turn [rad] of the dots within the circle, less the ``motion`` of the ball at ``centre`` (3,) under them."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Dots within the circle [px], (N, 2), and how much farther each went than the ball at ``centre`` (3,) under it [px]."""
     within = np.hypot(*(drag.before - circle[:2]).T) < circle[2]
     u, v = drag.before[within].T
     points = ball_points(sensor, u, v, centre, radius)
     moved = camera_of(sensor).project(motion.of(points, centre)) - drag.before[within]
-    return rigid_motion(drag.before[within], drag.motion[within] - moved, circle[:2])[1]
+    return drag.before[within], drag.motion[within] - moved
 
 
 def compared(
@@ -263,13 +263,20 @@ def main(args: Args) -> None:
     if under.sum() < 2:
         raise InputError("circle_px", value=args.circle_px, rule="must have at least two dots inside")
     seen, turn = rigid_motion(drag.before[under], drag.motion[under], circle[:2])
-    own, layers = BallMotion(seen * np.asarray(sensor.camera.pixel_pitch), turn=turn), None
+    own, layers, lag = BallMotion(seen * np.asarray(sensor.camera.pixel_pitch), turn=turn), None, {}
     if args.layers:
         assert ball.surface is not None
         place = ball.surface.contact_centre[0]
         centre = np.array([*place, radius - ball.depth + float(rest_height(sensor.gelpad, *place))])
         layers = layer_motion(drag.images, sensor, circle, centre, radius)
-        own = replace(layers.motion, turn=turn_by_dots(sensor, drag, circle, centre, radius, layers.motion))
+        places, farther = over_ball(sensor, drag, circle, centre, radius, layers.motion)
+        own = replace(layers.motion, turn=rigid_motion(places, farther, circle[:2])[1])
+        axis = seen / np.hypot(*seen)
+        is_ahead = (places - circle[:2]) @ axis > 0.0
+        lag = {
+            f"lag_{name}_um": -float((farther[m] @ axis).mean()) * pitch_um
+            for name, m in (("ahead", is_ahead), ("behind", ~is_ahead))
+        }
     if args.vary:
         name, variants = varied(sensor.gelpad, circle, args.vary)
         pads = {}
@@ -292,7 +299,7 @@ def main(args: Args) -> None:
             "markers.level": args.level,
         }
         if layers is not None:
-            figures = layers.figures(radius) | {"turn_deg": float(np.degrees(own.turn))}
+            figures = layers.figures(radius) | {"turn_deg": float(np.degrees(own.turn))} | lag
             metrics |= {f"markers.layers.{name}": value for name, value in figures.items()}
             print("layers: " + ", ".join(f"{name} {value:.4g}" for name, value in figures.items()), flush=True)
         residuals = {}

@@ -134,7 +134,10 @@ def test_a_turn_by_dots_is_what_the_balls_motion_leaves(dots: np.ndarray) -> Non
     x, y = (dots[within] - circle[:2]).T
     after[within] = camera_of(sensor).project(motion.of(points, centre)) + 0.02 * np.column_stack([-y, x])
     drag = drag_photographs.Drag(dots, after, 0, SIZE)
-    assert real_markers.turn_by_dots(sensor, drag, circle, centre, BALL, motion) == pytest.approx(0.02, abs=1e-9)
+    places, farther = real_markers.over_ball(sensor, drag, circle, centre, BALL, motion)
+    np.testing.assert_array_equal(places, dots[within])
+    moved, turn = drag_photographs.rigid_motion(places, farther, circle[:2])
+    assert turn == pytest.approx(0.02, abs=1e-9) and np.abs(moved).max() < 1e-9
 
 
 def test_detection_is_judged_by_other_thresholds(dots: np.ndarray) -> None:
