@@ -196,6 +196,15 @@ def turn_rotations(turn: np.ndarray) -> np.ndarray:
     return rotations(turn * (0.0, 0.0, 1.0)) @ rotations(turn * (1.0, 1.0, 0.0))
 
 
+def twist_of(rotation: np.ndarray) -> np.ndarray:
+    """Twist (…,) [rad] of ``turn_rotations`` (…, 3, 3), whatever the tilt before it.
+
+    The upper 2 × 2 block of a tilt is symmetric, with positive eigenvalues below 90°: the twist is the rotation in that block's polar
+    decomposition.
+    """
+    return np.arctan2(rotation[..., 1, 0] - rotation[..., 0, 1], rotation[..., 0, 0] + rotation[..., 1, 1])
+
+
 CLEARANCE = 1e-3
 """Height above first touch [m] at which an object waits before a press, after a release."""
 MOST_STEPS = 1_000_000
