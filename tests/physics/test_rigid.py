@@ -18,7 +18,7 @@ from raytac.physics.base import PadReading
 from raytac.physics.objects import object_parts
 from raytac.physics.press import CLEARANCE
 from raytac.physics.rigid.layer_response import reduced_modulus
-from raytac.physics.rigid.load_law import LoadLaw, first_touch, first_touch_z, gap_at_touch
+from raytac.physics.rigid.load_law import LoadLaw, first_touch, gap_at_touch
 from raytac.physics.rigid.pad import RigidPad
 from raytac.physics.rigid.rig import PressRig
 from raytac.specs import load_sensor
@@ -175,7 +175,7 @@ def test_sphere_touches_the_dome_where_geometry_says(position: tuple[float, floa
     above = -np.sqrt((4e-3) ** 2 - (x[None, :] - position[0]) ** 2 - (y[:, None] - position[1]) ** 2)
     expected = (rest_height(PAD, x[None, :], y[:, None]) - above).max()
     for pitch in (0.2e-3, 0.0634e-3):
-        found = first_touch_z(object_parts(scene.object), pose, PAD, make_grid(PAD, pitch))
+        found = first_touch(object_parts(scene.object), pose, PAD, make_grid(PAD, pitch)).z
         assert math.isclose(found, expected, abs_tol=1e-9)
 
 

@@ -255,9 +255,12 @@ def first_touch(parts: Sequence[Part], pose: np.ndarray, gelpad: GelpadSpec, gri
     return FirstTouch(-least, np.maximum(gaps - least, 0.0), gelpad.thickness + lowest - least, lever)
 
 
-def first_touch_z(parts: Sequence[Part], pose: np.ndarray, gelpad: GelpadSpec, grid: PadGrid) -> float:
-    """The height alone."""
-    return first_touch(parts, pose, gelpad, grid).z
+def too_deep(depth: float, deepest: float) -> InputError:
+    """Error for a ``depth`` [m] where the bonded face is at ``deepest`` [m], both below the first touch at the start."""
+    rule = f"would press deeper than the pad is there: at most {deepest * 1e3:.5g} mm"
+    if deepest <= 0.0:
+        rule = "would press deeper than the pad is there: so turned, the object reaches the bonded face before it is at any depth"
+    return InputError("depth [mm]", value=float(f"{depth * 1e3:.6g}"), rule=rule)
 
 
 def gap_at_touch(parts: Sequence[Part], pose: np.ndarray, grid: PadGrid) -> np.ndarray:

@@ -13,7 +13,7 @@ from raytac.gel.surface import GelSurface
 from raytac.gel.traction import foundation_traction
 from raytac.physics.base import PadReading
 from raytac.physics.press import CLEARANCE, TURNS, PressPad, PressSettings, turn_rotations
-from raytac.physics.rigid.load_law import LoadLaw, first_touch
+from raytac.physics.rigid.load_law import LoadLaw, first_touch, too_deep
 from raytac.physics.rigid.rig import PressRig
 from raytac.shapes.underside import object_height
 from raytac.specs.press import DYNAMICS, PressScene, StageSpec
@@ -165,7 +165,7 @@ class RigidPad(PressPad):
         if not e.by_force and stage.kind != "release":
             end = stage.depth if stage.kind == "indent" and stage.depth is not None else e.depth
             if end - lift > law.deepest:
-                raise self.targets.stage_error(index, stage, b, _too_deep(end, law.deepest + lift))
+                raise self.targets.stage_error(index, stage, b, too_deep(end, law.deepest + lift))
         if e.by_force:
             target = old.force + fraction * ((stage.force or old.force) - old.force)
             try:
@@ -244,8 +244,3 @@ def _wrench(surface: GelSurface, force: np.ndarray, twist_torque: np.ndarray) ->
     torque = np.cross(at, force)
     torque[:, 2] += twist_torque
     return np.concatenate([force, torque], axis=1)
-
-
-def _too_deep(depth: float, deepest: float) -> InputError:
-    rule = f"would press deeper than the pad is there: at most {deepest * 1e3:.5g} mm"
-    return InputError("depth [mm]", value=float(f"{depth * 1e3:.6g}"), rule=rule)

@@ -37,8 +37,14 @@ class PressController:
         self._clear()
         self._solver.reset()
 
-    def begin(self) -> None:
-        """Begin a stage where the object is now, at the prescribed force, or else the present one."""
+    def begin(self, index: int, stage: StageSpec) -> None:
+        """Begin a stage where the object is now, at the prescribed force, or else the present one.
+
+        One that is none of the scene's (``index`` −1) was not checked before: errors as of ``PressPlacement.end_of``.
+        """
+        if index < 0:
+            depth = np.where(np.isfinite(self._force), np.nan, self._depth)
+            self._placement.end_of(index, stage, depth, self._shear, self._turn)
         present = np.maximum(np.nan_to_num(self._solver.normal_force()), 0.0)
         self._start = self._depth.copy(), self._shear.copy(), self._turn.copy()
         self._start_force = np.where(np.isfinite(self._force), self._force, present)
