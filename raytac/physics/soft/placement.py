@@ -39,9 +39,12 @@ class PressPlacement:
         centres = np.where(targets.lost[:, None], 0.0, start + targets.offsets)
         self.origin = np.zeros((len(centres), 3))
         """Object's origin at first touch, zero shear and turn, shape (B, 3) [m]."""
+        self.lever = np.zeros(len(centres))
+        """Height of the origin over the gel that is touched there, (B,) [m]: what a tilt moves the contact by."""
         for b, (x, y) in enumerate(centres.tolist()):
             try:
-                self.origin[b] = x, y, self._touch(b, x, y, np.zeros(3))[0]
+                touch, _, self.lever[b] = self._touch(b, x, y, np.zeros(3))
+                self.origin[b] = x, y, touch
             except InputError as error:
                 raise targets.start_error(b, error) from error
         self._check_stages(scene)
