@@ -452,6 +452,23 @@ def test_what_one_environment_of_a_batch_cannot_do_is_named_with_it(own: dict, v
     assert caught.value.value == value
 
 
+@pytest.mark.parametrize(
+    ("own", "mentioned"),
+    [
+        ({"offsets": [[0.1e-3, 0.0], [0.0, 0.0]]}, r"offsets = \[0\.0001, 0\.0\]"),
+        ({"twists": [0.1, 0.0]}, "twists = 0.1"),
+        ({"rotations": [[0.999, 0.0, 0.0, 0.02], [1.0, 0.0, 0.0, 0.0]]}, "rotations = "),
+        ({"depths": [0.3e-3, 3.5e-3]}, r"depths \[mm\] = 3\.5"),
+    ],
+)
+def test_a_tilt_that_cannot_be_followed_is_not_blamed_on_what_the_environment_has_of_its_own(own: dict, mentioned: str) -> None:
+    """A disc 3.5 mm deep in 4 mm of gel, tilted by 29°: no environment could follow."""
+    scene = scene_of("cylinder", indent(3.5e-3), StageSpec("twist", twist=0.1), StageSpec("tilt", tilt=(0.0, 0.5)))
+    with pytest.raises(SpecError, match=rf"{mentioned}.*the depth kept here, 3\.5 mm") as caught:
+        press(scene, 1, num_envs=2, **{name: np.array(values) for name, values in own.items()})
+    assert caught.value.key == "trajectory[2].tilt_deg" and caught.value.value == pytest.approx([0.0, 28.6479])
+
+
 def test_impossible_scenes_are_refused() -> None:
     with pytest.raises(SpecError, match=r"object\.quaternion_wxyz.*unit quaternion"):
         press(scene_of("sphere", quaternion=(0.0, 0.0, 0.0, 0.0)))

@@ -259,7 +259,7 @@ def too_deep(depth: float, deepest: float) -> InputError:
     """Error for a ``depth`` [m] where the bonded face is at ``deepest`` [m], both below the first touch at the start."""
     rule = f"would press deeper than the pad is there: at most {deepest * 1e3:.5g} mm"
     if deepest <= 0.0:
-        rule = "would press deeper than the pad is there: so turned, the object reaches the bonded face before it is at any depth"
+        rule = "would press deeper than the pad is there: so turned, the object is past the bonded face at any depth"
     return InputError("depth [mm]", value=float(f"{depth * 1e3:.6g}"), rule=rule)
 
 
