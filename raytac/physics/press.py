@@ -135,7 +135,8 @@ class PressTargets:
     def stage_error(self, index: int, stage: StageSpec, b: int, error: InputError) -> InputError | SpecError:
         """``error`` of environment ``b`` in a stage, with the name of the target that caused it.
 
-        That is a target of its own, or the scene's.
+        That is a target of its own, or the scene's. After a ``tilt``, which only the scene has, it is the scene's, and own targets are
+        mentioned.
 
         Args:
             index: the stage's number in the scene, or −1. In a stage that is none of the scene's ``error`` stays as it is, unless a target
@@ -146,7 +147,9 @@ class PressTargets:
         """
         trajectory = self._scene.trajectory
         stages = trajectory[: index + 1] if index >= 0 else (*trajectory, stage)
-        own = self._responsible(b, [one.kind for one in reversed(stages)])
+        kinds = [one.kind for one in reversed(stages)]
+        since = kinds[: kinds.index("tilt")] if "tilt" in kinds else kinds
+        own = self._responsible(b, since, has_start="tilt" not in kinds)
         noun, unit = error.name.split()[0], {"force": "N", "depth [mm]": "mm"}.get(error.name)
         kept = f"the {noun} kept here, {error.value:.4g} {unit}, " if unit and stage.kind != "indent" else ""
         if error.name == "depth [mm]" and stage.kind == "indent" and self.depths is not None:
@@ -158,6 +161,11 @@ class PressTargets:
             return InputError(name, value=value, rule=f"in environment {b}, in {where}: {subject}{error.rule}")
         if index < 0:
             return error
+        others = self._responsible(b, kinds) if "tilt" in kinds else None
+        if others is None and "tilt" in kinds and self.depths is not None:
+            others = "depths [mm]", float(f"{1e3 * self.depths[b]:.6g}")
+        if others is not None:
+            kept = f"in environment {b}, which has {others[0]} = {others[1]}: {kept}"
         if stage.kind == "shear":
             name, value = "shear_mm", [float(f"{v * 1e3:.6g}") for v in stage.shear]
         elif stage.kind == "twist":
@@ -168,15 +176,17 @@ class PressTargets:
             name, value = {"depth [mm]": "depth_mm"}.get(error.name, "force_n"), error.value
         return SpecError(kept + error.rule, file=self._scene.source, key=f"trajectory[{index}].{name}", value=value)
 
-    def _responsible(self, b: int, kinds: Iterable[str]) -> tuple[str, object] | None:
+    def _responsible(self, b: int, kinds: Iterable[str], *, has_start: bool = True) -> tuple[str, object] | None:
         """Name and value of the own target that put environment ``b`` where it is; None if none did.
 
-        ``kinds``: of the stages so far, the last one first; before them come its offset and its rotation.
+        ``kinds``: of the stages so far, the last one first; before them come its offset and its rotation, unless ``has_start`` is false.
         """
         for kind in kinds:
             values = self._own_targets.get(kind)
             if values is not None:
                 return f"{kind}s", values[b].tolist()
+        if not has_start:
+            return None
         if self.offsets[b].any():
             return "offsets", self.offsets[b].tolist()
         return ("rotations", self._quaternions[b].tolist()) if self._quaternions[b, 1:].any() else None
@@ -194,6 +204,15 @@ TURNS = ("twist", "tilt")
 def turn_rotations(turn: np.ndarray) -> np.ndarray:
     """Rotations (…, 3, 3) of a ``turn`` (…, 3) [rad]: tilt along x and y, then twist about z."""
     return rotations(turn * (0.0, 0.0, 1.0)) @ rotations(turn * (1.0, 1.0, 0.0))
+
+
+def twist_of(rotation: np.ndarray) -> np.ndarray:
+    """Twist (…,) [rad] of ``turn_rotations`` (…, 3, 3), whatever the tilt before it.
+
+    The upper 2 × 2 block of a tilt is symmetric, with positive eigenvalues below 90°: the twist is the rotation in that block's polar
+    decomposition.
+    """
+    return np.arctan2(rotation[..., 1, 0] - rotation[..., 0, 1], rotation[..., 0, 0] + rotation[..., 1, 1])
 
 
 CLEARANCE = 1e-3

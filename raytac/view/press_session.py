@@ -11,6 +11,7 @@ import numpy as np
 from raytac.errors import RaytacError
 from raytac.frame import TactileFrame
 from raytac.physics.base import PadReading
+from raytac.physics.press import twist_of
 from raytac.physics.soft.bodies import OBJECT, PAD
 from raytac.physics.soft.pad import SoftPad
 from raytac.sensor import TactileSensor
@@ -167,7 +168,7 @@ class PressSession:
             "force": float(self._state.normal_force[0]),
             "shear_x": float(x),
             "shear_y": float(y),
-            "twist": float(np.degrees(np.arctan2(turned[1, 0], turned[0, 0]))),
+            "twist": float(np.degrees(twist_of(turned))),
         }
 
     def _object_solids(self) -> tuple[Solid, ...]:

@@ -18,9 +18,10 @@ from raytac.physics.base import PadReading
 from raytac.physics.objects import object_parts
 from raytac.physics.press import CLEARANCE
 from raytac.physics.rigid.layer_response import reduced_modulus
-from raytac.physics.rigid.load_law import LoadLaw, first_touch, first_touch_z, gap_at_touch
+from raytac.physics.rigid.load_law import LoadLaw, first_touch, gap_at_touch
 from raytac.physics.rigid.pad import RigidPad
 from raytac.physics.rigid.rig import PressRig
+from raytac.specs import load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 from raytac.specs.sensor import (
     CameraSpec,
@@ -174,7 +175,7 @@ def test_sphere_touches_the_dome_where_geometry_says(position: tuple[float, floa
     above = -np.sqrt((4e-3) ** 2 - (x[None, :] - position[0]) ** 2 - (y[:, None] - position[1]) ** 2)
     expected = (rest_height(PAD, x[None, :], y[:, None]) - above).max()
     for pitch in (0.2e-3, 0.0634e-3):
-        found = first_touch_z(object_parts(scene.object), pose, PAD, make_grid(PAD, pitch))
+        found = first_touch(object_parts(scene.object), pose, PAD, make_grid(PAD, pitch)).z
         assert math.isclose(found, expected, abs_tol=1e-9)
 
 
@@ -187,7 +188,7 @@ def test_first_touch_has_no_overlap_and_no_gap(kind: str) -> None:
     pose = state.pad_from_object[0].copy()
     pose[2, 3] -= CLEARANCE
     gap = gap_at_touch(pad.parts, pose, pad.grid)
-    z, found, _ = first_touch(pad.parts, pose, pad.sensor.gelpad, pad.grid)
+    z, found, _, _ = first_touch(pad.parts, pose, pad.sensor.gelpad, pad.grid)
     assert z == pytest.approx(pose[2, 3], abs=1e-9)
     np.testing.assert_allclose(found, gap, atol=1e-9)
     assert 0.0 <= gap.min() < 20e-6  # a sharp corner may lie between nodes
@@ -257,20 +258,28 @@ def test_a_tilt_turns_the_object_about_its_origin_before_the_twist() -> None:
     assert tilted.surface.contact_centre[0, 0] > 0.1e-3 > 10.0 * abs(tilted.surface.contact_centre[0, 1])
 
 
-def test_a_ball_that_rolls_does_not_shear_the_gel() -> None:
-    """Its lowest point stays: shear −R ω × z. A tilt alone shears as R ω × z, up to slip; so a slide against it doubles it."""
-    radius, angle = float(OBJECTS["sphere"]["radius"]), 0.004
+@pytest.mark.parametrize("at", [0.0, 7e-3])
+def test_a_ball_that_rolls_does_not_shear_the_gel(at: float) -> None:
+    """Its lowest point stays: shear −R ω × z. A tilt alone shears as R ω × z, up to slip; so a slide against it doubles it.
+
+    So it is on the flank of a strong dome, where the ball touches lower, and R cos θ below its middle.
+    """
+    dome, radius, angle = load_sensor("gelsight_dome"), float(OBJECTS["sphere"]["radius"]), 0.004
+    lever = radius * math.cos(math.asin(at / (dome.gelpad.dome_radius[0] + radius)))
+
+    def shear_of(*stages: StageSpec) -> np.ndarray:
+        scene = scene_of("sphere", indent(0.5e-3), *stages, position=(at, 0.0, 0.0))
+        return list(RigidPad(dome, scene, pitch=0.2e-3).run())[-1].shear_force[0]
+
     tilt = StageSpec("tilt", tilt=(0.6 * angle, -0.8 * angle))
-    path = radius * angle * np.array([0.8, 0.6])  # of the lowest point under the tilt alone
-    shear_force = {}
-    for name, shear in (("roll", -path), ("tilt", 0.0 * path), ("slide", path)):
-        stages = indent(0.5e-3), StageSpec("shear", shear=tuple(shear.tolist())), tilt
-        shear_force[name] = press(scene_of("sphere", *stages))[1][-1].shear_force[0]
-    _, states = press(scene_of("sphere", indent(0.5e-3), StageSpec("shear", shear=tuple(path.tolist()))))
-    assert np.hypot(*states[-1].shear_force[0]) > 0.01
-    np.testing.assert_allclose(shear_force["tilt"], states[-1].shear_force[0], rtol=0.01)
-    np.testing.assert_allclose(shear_force["slide"], 2.0 * shear_force["tilt"], rtol=0.01)
-    assert np.hypot(*shear_force["roll"]) < 0.01 * np.hypot(*shear_force["tilt"])
+    path = lever * angle * np.array([0.8, 0.6])  # of the matter that touches under the tilt alone
+    shears = {"roll": -path, "tilt": 0.0 * path, "slide": path}
+    shear_force = {name: shear_of(StageSpec("shear", shear=tuple(shear.tolist())), tilt) for name, shear in shears.items()}
+    alone = shear_of(StageSpec("shear", shear=tuple(path.tolist())))
+    assert np.hypot(*alone) > 0.005
+    np.testing.assert_allclose(shear_force["tilt"], alone, rtol=0.01)
+    np.testing.assert_allclose(shear_force["slide"], 2.0 * alone, rtol=0.01)
+    assert np.hypot(*shear_force["roll"]) < 0.01 * np.hypot(*alone)
 
 
 def test_shear_force_sticks_then_slips_at_the_friction_limit() -> None:
@@ -441,6 +450,23 @@ def test_what_one_environment_of_a_batch_cannot_do_is_named_with_it(own: dict, v
     with pytest.raises(InputError, match=f"{name} = .*in environment 1, (in|at) {where}: no part of the object") as caught:
         press(scene, 1, num_envs=3, **{name: np.array(own[name], float)})
     assert caught.value.value == value
+
+
+@pytest.mark.parametrize(
+    ("own", "mentioned"),
+    [
+        ({"offsets": [[0.1e-3, 0.0], [0.0, 0.0]]}, r"offsets = \[0\.0001, 0\.0\]"),
+        ({"twists": [0.1, 0.0]}, "twists = 0.1"),
+        ({"rotations": [[0.999, 0.0, 0.0, 0.02], [1.0, 0.0, 0.0, 0.0]]}, "rotations = "),
+        ({"depths": [0.3e-3, 3.5e-3]}, r"depths \[mm\] = 3\.5"),
+    ],
+)
+def test_a_tilt_that_cannot_be_followed_is_not_blamed_on_what_the_environment_has_of_its_own(own: dict, mentioned: str) -> None:
+    """A disc 3.5 mm deep in 4 mm of gel, tilted by 29°: no environment could follow."""
+    scene = scene_of("cylinder", indent(3.5e-3), StageSpec("twist", twist=0.1), StageSpec("tilt", tilt=(0.0, 0.5)))
+    with pytest.raises(SpecError, match=rf"{mentioned}.*the depth kept here, 3\.5 mm") as caught:
+        press(scene, 1, num_envs=2, **{name: np.array(values) for name, values in own.items()})
+    assert caught.value.key == "trajectory[2].tilt_deg" and caught.value.value == pytest.approx([0.0, 28.6479])
 
 
 def test_impossible_scenes_are_refused() -> None:

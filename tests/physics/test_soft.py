@@ -325,6 +325,23 @@ def test_bad_input_is_named():
         next(pad.run(0))
 
 
+def test_a_tilt_past_the_bonded_face_is_refused_before_a_step():
+    """A disc 3.4 mm deep in 4 mm of gel, whose rim would go 1.5 mm deeper: in the scene, as a further stage, after a release."""
+    tilt, level, deep = StageSpec("tilt", tilt=(0.0, 0.8)), StageSpec("tilt"), indent(3.4e-3)
+    past = r"3\.4.*deeper than the pad is there: at most 2\.45"
+    with pytest.raises(SpecError, match=rf"trajectory\[1\]\.tilt_deg = \[0\.0, 45\.8366\].*{past}"):
+        soft(press(deep, tilt, kind="cylinder"))
+    with pytest.raises(SpecError, match=rf"trajectory\[3\]\.depth_mm = {past}"):
+        soft(press(indent(0.4e-3), tilt, StageSpec("release"), deep, kind="cylinder"))
+    pad = soft(press(indent(0.4e-3), tilt, level, deep, kind="cylinder"))
+    pad.reset()
+    assert pad._drive is not None
+    pad._drive.begin(-1, tilt)  # 1 mm above the pad it may be tilted
+    pad._drive._depth[:] = 3.4e-3
+    with pytest.raises(InputError, match=past):
+        pad._drive.begin(-1, tilt)
+
+
 def test_an_object_that_overlaps_the_pad_at_the_start_is_named(tmp_path):
     """A ball with a blade beside it that reaches lower, thinner than the grid that looks for the first touch."""
     import trimesh

@@ -200,6 +200,21 @@ def test_a_case_that_moves_leaves_the_object_where_it_is():
     assert abs(drop[0]) < 1e-9 and drop[1] < -0.1e-3  # a tilted face touches earlier, with its rim
 
 
+def test_a_tilt_goes_in_steps_of_the_path_that_it_drags_the_contact():
+    """A large ball, whose lowest point goes 0.6 mm by a small angle: as many steps as a shear of 0.6 mm; a twist by it needs one."""
+    radius, angle, at = 20e-3, 0.03, np.full(1, 0.3e-3)
+    pad = soft(press(indent(at[0]), StageSpec("tilt", tilt=(angle, 0.0)), radius=radius))
+    drive, counts = pad._drive, []
+    assert drive is not None
+    for shear, turn in (((0.0, radius * angle), np.zeros(3)), (np.zeros(2), (angle, 0.0, 0.0)), (np.zeros(2), (0.0, 0.0, angle))):
+        drive.reset()
+        drive._depth, poses = at, []
+        drive._step = lambda poses=poses: poses.append(drive.poses())
+        drive._move(at, np.array([shear]), np.array([turn]))
+        counts.append(len(poses))
+    assert counts == [6, 6, 1]
+
+
 def test_an_object_is_not_tilted_farther_than_its_surface_was_made_for():
     pad = soft(press(indent(0.4e-3), StageSpec("tilt", tilt=(0.03, 0.04)), kind="cylinder"))
     with pytest.raises(InputError, match="tilt farther"):

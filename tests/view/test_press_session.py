@@ -84,6 +84,24 @@ def test_sliders_take_the_object_where_they_say(rigid):
     assert shot.pads[SENSOR.name].values["indentation"].max() < 1e-9 and float(shot.facts["depth"].split()[0]) < -0.5
 
 
+def test_the_twist_is_that_of_its_slider_after_a_tilt_of_the_scene():
+    """The tilt stays; a twist of 0 is there already, and one of 10° turns the object by 10° about the normal."""
+    stages = StageSpec("indent", depth=0.5e-3), StageSpec("tilt", tilt=(0.5, 0.5))
+    press = session(replace(SCENE, trajectory=stages))
+    while press.advance():
+        pass
+    tilted = press.snapshot()
+    assert tilted.controls["twist"] == pytest.approx(0.0, abs=1e-9) and tilted.handle is not None
+    np.testing.assert_allclose(tilted.handle.pose[:3, :3], np.eye(3), atol=1e-9)
+    press.drive({"twist": 0.0})
+    assert not press.advance()
+    twisted = driven(press, twist=10.0)
+    assert press._places()["twist"] == pytest.approx(10.0)
+    about_z = twisted.poses["object"][:3, :3] @ tilted.poses["object"][:3, :3].T
+    np.testing.assert_allclose(about_z[:, 2], (0.0, 0.0, 1.0), atol=1e-9)
+    assert np.degrees(np.arctan2(about_z[1, 0], about_z[0, 0])) == pytest.approx(10.0)
+
+
 def test_a_force_takes_over_from_a_depth_and_is_kept_through_a_shear(rigid):
     driven(rigid, depth=0.2)
     shot = driven(rigid, force=1.5)

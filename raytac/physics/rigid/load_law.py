@@ -220,6 +220,8 @@ class FirstTouch(NamedTuple):
     """Gap of ``gap_at_touch`` at that height, (Ny, Nx) [m]."""
     deepest: float
     """Travel [m] from there to the bonded face: the thickness, less on the dome's flanks."""
+    lever: float
+    """Height of the object's origin over the gel that it touches [m]."""
 
 
 def first_touch(parts: Sequence[Part], pose: np.ndarray, gelpad: GelpadSpec, grid: PadGrid) -> FirstTouch:
@@ -242,19 +244,23 @@ def first_touch(parts: Sequence[Part], pose: np.ndarray, gelpad: GelpadSpec, gri
         return underside(x, y) - rest_height(gelpad, x[None, :], y[:, None])
 
     gaps = gap(grid.x, grid.y)
-    least = _least(gap, gaps, grid)
+    least, x, y = _least(gap, gaps, grid)
     if not np.isfinite(least):
         low, high = object_bounds(parts, above)
         span = f"x {low[0]:.4g}…{high[0]:.4g}, y {low[1]:.4g}…{high[1]:.4g} m"
         rule = f"no part of the object, which spans {span}, is above a node of the pad"
         raise InputError("position", value=tuple(above[:2, 3].tolist()), rule=rule)
-    lowest = _least(underside, gaps + grid.rest, grid)
-    return FirstTouch(-least, np.maximum(gaps - least, 0.0), gelpad.thickness + lowest - least)
+    lowest, _, _ = _least(underside, gaps + grid.rest, grid)
+    lever = -least - float(rest_height(gelpad, np.array(x), np.array(y)))
+    return FirstTouch(-least, np.maximum(gaps - least, 0.0), gelpad.thickness + lowest - least, lever)
 
 
-def first_touch_z(parts: Sequence[Part], pose: np.ndarray, gelpad: GelpadSpec, grid: PadGrid) -> float:
-    """The height alone."""
-    return first_touch(parts, pose, gelpad, grid).z
+def too_deep(depth: float, deepest: float) -> InputError:
+    """Error for a ``depth`` [m] where the bonded face is at ``deepest`` [m], both below the first touch at the start."""
+    rule = f"would press deeper than the pad is there: at most {deepest * 1e3:.5g} mm"
+    if deepest <= 0.0:
+        rule = "would press deeper than the pad is there: so turned, the object is past the bonded face at any depth"
+    return InputError("depth [mm]", value=float(f"{depth * 1e3:.6g}"), rule=rule)
 
 
 def gap_at_touch(parts: Sequence[Part], pose: np.ndarray, grid: PadGrid) -> np.ndarray:
@@ -262,15 +268,15 @@ def gap_at_touch(parts: Sequence[Part], pose: np.ndarray, grid: PadGrid) -> np.n
     return np.maximum(object_height(parts, pose[None], grid.x, grid.y)[0] - grid.rest, 0.0)
 
 
-def _least(of: Callable[[np.ndarray, np.ndarray], np.ndarray], values: np.ndarray, grid: PadGrid) -> float:
-    """Least value of a function over the pad, zooming in on the lowest of its node ``values``."""
-    x, y, least = grid.x, grid.y, np.inf
+def _least(of: Callable[[np.ndarray, np.ndarray], np.ndarray], values: np.ndarray, grid: PadGrid) -> tuple[float, float, float]:
+    """Least value of a function over the pad and its x, y [m], zooming in on the lowest of its node ``values``."""
+    x, y, least = grid.x, grid.y, (np.inf, 0.0, 0.0)
     for zoom in range(_ZOOMS + 1):
         if zoom:
             values = of(x, y)
         j, i = np.unravel_index(np.argmin(values), values.shape)
-        least = min(least, float(values[j, i]))
-        if not np.isfinite(least):
+        least = min(least, (float(values[j, i]), float(x[i]), float(y[j])), key=lambda one: one[0])
+        if not np.isfinite(least[0]):
             break
         x, y = _around(x, int(i), grid.x), _around(y, int(j), grid.y)
     return least

@@ -13,7 +13,7 @@ from raytac.gel.surface import GelSurface
 from raytac.gel.traction import foundation_traction
 from raytac.physics.base import PadReading
 from raytac.physics.press import CLEARANCE, TURNS, PressPad, PressSettings, turn_rotations
-from raytac.physics.rigid.load_law import LoadLaw, first_touch
+from raytac.physics.rigid.load_law import LoadLaw, first_touch, too_deep
 from raytac.physics.rigid.rig import PressRig
 from raytac.shapes.underside import object_height
 from raytac.specs.press import DYNAMICS, PressScene, StageSpec
@@ -61,7 +61,7 @@ class RigidPad(PressPad):
             raise SpecError(rule, file=scene.source, key="object.dynamics", value="soft", choices=choices)
         super().__init__(sensor, scene, **settings)
         self._surround = ElasticSurround(self.grid, thickness=sensor.gelpad.thickness)
-        self._touches: dict[bytes, tuple[float, LoadLaw]] = {}
+        self._touches: dict[bytes, tuple[float, LoadLaw, float]] = {}
         self._environments: list[_Environment] = []
         """State of every environment at the last reading; empty before, and without an object."""
         self._begun: tuple[int, int, list[_Environment]] = -1, 1, []
@@ -107,7 +107,7 @@ class RigidPad(PressPad):
         if self.targets.lost[b]:
             return _Environment(np.full(3, np.nan), self._rig(1.0), failed=True)
         try:
-            touch, law = self._touch(b, x, y, np.zeros(3))
+            touch, law, _ = self._touch(b, x, y, np.zeros(3))
         except InputError as error:
             raise self.targets.start_error(b, error) from error
         stiffest = law.stiffest(max((stage.force or 0.0 for stage in self.scene.trajectory), default=0.0))
@@ -119,15 +119,16 @@ class RigidPad(PressPad):
     def _rig(self, stiffest: float) -> PressRig:
         return PressRig(self.scene.object.mass, stiffest, self.scene.moves)
 
-    def _touch(self, b: int, x: float, y: float, turn: np.ndarray) -> tuple[float, LoadLaw]:
-        """First-touch height of the object's origin and load law at a place and turn; cached."""
+    def _touch(self, b: int, x: float, y: float, turn: np.ndarray) -> tuple[float, LoadLaw, float]:
+        """First-touch height of the object's origin, load law and lever at a place and turn; cached."""
         pose = np.eye(4)
         pose[:3, :3] = turn_rotations(turn) @ self.targets.rotations[b]
         pose[:2, 3] = x, y
         key = pose.tobytes()
         if key not in self._touches:
             touch = first_touch(self.parts, pose, self.sensor.gelpad, self.grid)
-            self._touches[key] = touch.z, LoadLaw(touch.gap, self.grid.x, self.grid.y, self.sensor.gelpad, touch.deepest)
+            law = LoadLaw(touch.gap, self.grid.x, self.grid.y, self.sensor.gelpad, touch.deepest)
+            self._touches[key] = touch.z, law, touch.lever
         return self._touches[key]
 
     def _advance(
@@ -145,12 +146,12 @@ class RigidPad(PressPad):
             end = (*old.turn[:2], stage.twist) if stage.kind == "twist" else (*stage.tilt, old.turn[2])
             turn = old.turn + fraction * (np.array(end) - old.turn)
         try:
-            touch, law = self._touch(b, e.origin[0] + shear[0], e.origin[1] + shear[1], turn)
+            touch, law, lever = self._touch(b, e.origin[0] + shear[0], e.origin[1] + shear[1], turn)
         except InputError as error:
             raise self.targets.stage_error(index, stage, b, error) from error
-        # The matter that touches is below the origin, at about the height of first touch.
+        # The matter that touches first stands for the contact; its rim is nearer the origin's height, by the depth at most.
         tilted = turn_rotations(np.array([0.0, 0.0, turn[2]]))[:2, :2] @ (turn - e.turn)[:2]
-        e.slid = e.slid + shear - e.shear + touch * np.array([-tilted[1], tilted[0]])
+        e.slid = e.slid + shear - e.shear + lever * np.array([-tilted[1], tilted[0]])
         e.shear, e.turn = shear, turn
         if stage.kind == "indent":
             e.by_force = stage.force is not None
@@ -164,7 +165,7 @@ class RigidPad(PressPad):
         if not e.by_force and stage.kind != "release":
             end = stage.depth if stage.kind == "indent" and stage.depth is not None else e.depth
             if end - lift > law.deepest:
-                raise self.targets.stage_error(index, stage, b, _too_deep(end, law.deepest + lift))
+                raise self.targets.stage_error(index, stage, b, too_deep(end, law.deepest + lift))
         if e.by_force:
             target = old.force + fraction * ((stage.force or old.force) - old.force)
             try:
@@ -188,7 +189,7 @@ class RigidPad(PressPad):
             return
         if e.stuck_slid is None:
             e.stuck_slid, e.stuck_twist = e.slid.copy(), e.turn[2]
-        _, law = self._touch(b, e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.turn)
+        _, law, _ = self._touch(b, e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.turn)
         stretch, angle = e.slid - e.stuck_slid, e.turn[2] - e.stuck_twist
         limit = self.sensor.gelpad.friction * e.force
         longest = limit / law.shear_stiffness(e.rig.depth)
@@ -214,7 +215,7 @@ class RigidPad(PressPad):
                 case[b, :3, 3] = e.origin + tilt.T @ (case[b, :3, 3] - e.origin)
             depth[b], force[b, 2] = e.depth, -e.force
             if e.stuck_slid is not None and e.shear is not None:
-                _, law = self._touch(b, e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.turn)
+                _, law, _ = self._touch(b, e.origin[0] + e.shear[0], e.origin[1] + e.shear[1], e.turn)
                 force[b, :2] = law.shear_stiffness(e.rig.depth) * (e.slid - e.stuck_slid)
                 area[b] = law.contact_area(e.rig.depth)
                 torque[b] = law.twist_stiffness(e.rig.depth) * (e.turn[2] - e.stuck_twist)
@@ -243,8 +244,3 @@ def _wrench(surface: GelSurface, force: np.ndarray, twist_torque: np.ndarray) ->
     torque = np.cross(at, force)
     torque[:, 2] += twist_torque
     return np.concatenate([force, torque], axis=1)
-
-
-def _too_deep(depth: float, deepest: float) -> InputError:
-    rule = f"would press deeper than the pad is there: at most {deepest * 1e3:.5g} mm"
-    return InputError("depth [mm]", value=float(f"{depth * 1e3:.6g}"), rule=rule)

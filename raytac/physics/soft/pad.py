@@ -111,7 +111,7 @@ class SoftPad(PressPad):
     def begin(self, index: int, stage: StageSpec, steps: int) -> None:
         assert self._drive is not None
         self._bar.set_postfix_str(f"stage {index + 1} of {len(self.scene.trajectory)}: {stage.kind}")
-        self._drive.begin()
+        self._drive.begin(index, stage)
 
     def advance(self, stage: StageSpec, fraction: float) -> None:
         assert self._drive is not None

@@ -37,8 +37,14 @@ class PressController:
         self._clear()
         self._solver.reset()
 
-    def begin(self) -> None:
-        """Begin a stage where the object is now, at the prescribed force, or else the present one."""
+    def begin(self, index: int, stage: StageSpec) -> None:
+        """Begin a stage where the object is now, at the prescribed force, or else the present one.
+
+        One that is none of the scene's (``index`` −1) was not checked before: errors as of ``PressPlacement.end_of``.
+        """
+        if index < 0:
+            depth = np.where(np.isfinite(self._force), np.nan, self._depth)
+            self._placement.end_of(index, stage, depth, self._shear, self._turn)
         present = np.maximum(np.nan_to_num(self._solver.normal_force()), 0.0)
         self._start = self._depth.copy(), self._shear.copy(), self._turn.copy()
         self._start_force = np.where(np.isfinite(self._force), self._force, present)
@@ -111,12 +117,16 @@ class PressController:
     ) -> None:
         """Move in a straight line, in steps of at most ``SubstepLimits.step`` times ``stretch``.
 
-        A prescribed force is kept at each of them; so is the depth if the controller is to ``follow`` the clearance.
+        A turn counts as the path of the surface that touches. A prescribed force is kept at each step; so is the depth if the controller
+        is to ``follow`` the clearance.
         """
         limits = self._limits
         start = np.maximum(self._depth, -self._d_hat) if stretch == 1.0 else self._depth
-        by_turn = np.linalg.norm(turn - self._turn, axis=1) * (limits.step / limits.turn)
-        lengths = np.abs(depth - start), np.linalg.norm(shear - self._shear, axis=1), by_turn
+        change, arm = turn - self._turn, limits.step / limits.turn
+        # A twist is about the contact; a tilt about the object's origin, which may be far above it.
+        by_twist = arm * np.abs(change[:, 2])
+        by_tilt = np.maximum(arm, self._placement.lever) * np.linalg.norm(change[:, :2], axis=1)
+        lengths = np.abs(depth - start), np.linalg.norm(shear - self._shear, axis=1), by_twist, by_tilt
         steps = max(int(np.ceil(max(length.max() for length in lengths) / (limits.step * stretch) - 1e-9)), 1)
         start_shear, start_turn = self._shear, self._turn
         for step in range(1, steps + 1):
