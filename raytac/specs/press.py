@@ -160,6 +160,13 @@ class PressScene:
         if not isinstance(self.trajectory, tuple) or not all(isinstance(stage, StageSpec) for stage in self.trajectory):
             raise SpecError("must be a tuple of StageSpec", file=self.source, key="trajectory", value=self.trajectory)
         check_fields(vars(self), SCENE_SCHEMA, file=self.source)
+        for index, stage in enumerate(self.trajectory if self.object.dynamics == "affine" else ()):
+            if stage.kind not in ("indent", "release") or stage.depth is not None:
+                rule = (
+                    "a free body (affine) can only be laid on the pad by its weight, with indent to a force_n and release, "
+                    f"not as trajectory[{index}] has it ({stage.kind})"
+                )
+                raise SpecError(rule, file=self.source, key="object.dynamics", value=self.object.dynamics)
 
     @property
     def peak_stage(self) -> int:

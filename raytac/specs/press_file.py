@@ -55,9 +55,6 @@ def load_press(name_or_path: str | Path) -> PressScene:
     if target.kind != "none" and not stages:
         raise top.error("at least one [[trajectory]] stage is needed to press the object", "trajectory")
     trajectory = _read_trajectory(stages)
-    if target.dynamics == "affine" and any(s.kind not in ("indent", "release") or s.depth is not None for s in trajectory):
-        rule = "a free body (affine) can only be laid on the pad by its weight: indent with force_n, and release"
-        raise top.section("object").error(rule, "dynamics", target.dynamics)
     return PressScene(name_of(path), target, trajectory, scene["moves"], path, scene["physics"], scene["pad"])
 
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from raytac.errors import SpecError
+from raytac.physics.rigid.pad import RigidPad
 from raytac.specs import load_press, load_sensor
+from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 
 SCENE = """{top}
 [object]
@@ -49,6 +53,22 @@ def test_contradictions_are_named(tmp_path, settings, words):
 
 def test_a_weight_needs_a_force(tmp_path):
     assert load_press(write(tmp_path, object='dynamics = "affine"', indent="force_n = 0.5")).object.dynamics == "affine"
+
+
+@pytest.mark.parametrize(
+    "stage",
+    [StageSpec("tilt", tilt=(0.2, 0.0)), StageSpec("twist", twist=0.1), StageSpec("shear"), StageSpec("indent", depth=1e-4)],
+)
+def test_a_free_body_made_in_python_is_only_laid_down_either(stage):
+    """It would lie still through the stage; a further stage is refused by the same rule."""
+    ball = ObjectSpec("sphere", {"radius": 4e-3}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.05, "affine")
+    laid = PressScene("laid", ball, (StageSpec("indent", force=0.5), StageSpec("release")))
+    rule = rf"object\.dynamics = 'affine'.*force_n.*trajectory\[{{}}\] has it \({stage.kind}\)"
+    with pytest.raises(SpecError, match=rule.format(2)):
+        replace(laid, trajectory=(*laid.trajectory, stage))
+    pad = RigidPad(load_sensor("gelsight_mini"), laid, pitch=0.5e-3)
+    with pytest.raises(SpecError, match=rule.format(0)):
+        next(pad.follow(stage))
 
 
 def test_the_case_holds_the_back_unless_the_sensor_says_more(tmp_path):
