@@ -23,6 +23,8 @@ from raytac.specs import SensorSpec
 
 REACH, DARK, LEAST = 9.0, (0.1, 0.9), 15.0
 """Window of a dot's centroid [px]; darkness that counts not at all and wholly; least dark area of a dot [px]."""
+OTHER_DARK = (0.05, 0.5), (0.2, 0.6)
+"""Other such thresholds, by which the detection of dots is judged."""
 BAND = 1.2, 3.0
 """Gaussians [px] whose difference keeps the rings."""
 DOT = 0.12
@@ -83,20 +85,20 @@ def _places(path: Path) -> np.ndarray:
     return (start + motion).reshape(-1, 2)
 
 
-def dot_centres(image: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def dot_centres(image: np.ndarray, near: np.ndarray, dark: tuple[float, float] = DARK) -> tuple[np.ndarray, np.ndarray]:
     """Centroids of dark dots [px], (N, 2), and their dark areas [px], (N,).
 
-    ``image`` (H, W, 3), ``near`` (N, 2): about where dots are [px]. Darkness is 1 less the brightest channel over what surrounds
-    the dot. The window of the centroid follows it until it stands still.
+    ``image`` (H, W, 3), ``near`` (N, 2): about where dots are [px]; ``dark``: as ``DARK``. Darkness is 1 less the brightest channel over
+    what surrounds the dot. The window of the centroid follows it until it stands still.
     """
     bright = image[..., :3].max(axis=2).astype(float)
     behind = ndimage.gaussian_filter(ndimage.percentile_filter(bright, 80, size=int(3 * REACH)), 6.0)
-    dark = np.clip((1.0 - bright / np.maximum(behind, 1.0) - DARK[0]) / (DARK[1] - DARK[0]), 0.0, 1.0)
+    darkness = np.clip((1.0 - bright / np.maximum(behind, 1.0) - dark[0]) / (dark[1] - dark[0]), 0.0, 1.0)
     v, u = np.mgrid[: bright.shape[0], : bright.shape[1]] + 0.5
     centres, areas = np.array(near, float), np.zeros(len(near))
     for k, centre in enumerate(centres):
         for _ in range(20):
-            weight = dark * (np.hypot(u - centre[0], v - centre[1]) < REACH)
+            weight = darkness * (np.hypot(u - centre[0], v - centre[1]) < REACH)
             areas[k] = weight.sum()
             if areas[k] < LEAST:
                 break
@@ -117,6 +119,17 @@ def rigid_motion(places: np.ndarray, motion: np.ndarray, centre: np.ndarray) -> 
     return np.array([u, v]), float(turn)
 
 
+def detection_error(drag: Drag) -> float:
+    """RMS change of the dots' motion by other thresholds of darkness [px]: glare and uneven ink move a centroid with them."""
+    changes = []
+    for dark in OTHER_DARK:
+        before, after = (
+            dot_centres(image, at, dark)[0] for image, at in zip(drag.images, (drag.before, drag.after), strict=True)
+        )
+        changes.append(((after - before - drag.motion) ** 2).sum(axis=1))
+    return float(np.sqrt(np.mean(changes)))
+
+
 @dataclass(frozen=True)
 class BallMotion:
     """Motion of a ball from one photograph to the other, pad frame."""
@@ -131,6 +144,10 @@ class BallMotion:
     def lowest(self, radius: float) -> np.ndarray:
         """Displacement of the lowest point of a ball of ``radius`` [m], (2,) [m]."""
         return self.shear + radius * np.array([-self.tilt[1], self.tilt[0]])
+
+    def of(self, points: np.ndarray, centre: np.ndarray) -> np.ndarray:
+        """Where ``points`` (N, 3) of a ball at ``centre`` (3,) go, without its turn about z [m]."""
+        return centre + np.array([*self.shear, 0.0]) + Rotation.from_rotvec([*self.tilt, 0.0]).apply(points - centre)
 
 
 @dataclass(frozen=True)
@@ -168,11 +185,12 @@ def layer_motion(
     points = ball_points(sensor, u, v, centre, radius)
     is_ball = is_coat & np.isfinite(points[..., 0])
 
+    def motion_of(lowest: np.ndarray, tilt: np.ndarray) -> BallMotion:
+        return BallMotion(lowest - radius * np.array([-tilt[1], tilt[0]]), tilt)
+
     def correlation(lowest: np.ndarray, tilt: np.ndarray, used: np.ndarray) -> float:
         """Correlation of the rings at ``used`` pixels (H, W) of the first photograph; 0 for too few."""
-        shear = lowest - radius * np.array([-tilt[1], tilt[0]])
-        turned = Rotation.from_rotvec([*tilt, 0.0]).apply(points[used] - centre)
-        place = camera.project(centre + np.array([*shear, 0.0]) + turned).T[::-1] - 0.5
+        place = camera.project(motion_of(lowest, tilt).of(points[used], centre)).T[::-1] - 0.5
         seen = ndimage.map_coordinates(later, place, order=1) > 0.99
         if seen.sum() < 50:
             return 0.0
@@ -202,12 +220,11 @@ def layer_motion(
     shift = best(np.array(coarse[1:]), (0.5, 0.5))
     full = min((best(np.array([*shift.x, *tilt]), (0.5, 0.5, 0.03, 0.03)) for tilt in TILTS), key=lambda result: result.fun)
     lowest, tilt = pitch * full.x[:2], full.x[2:]
-    motion = BallMotion(lowest - radius * np.array([-tilt[1], tilt[0]]), tilt)
     edges = np.arange(circle[2] - 6 * ANNULUS, circle[2] + BEYOND, ANNULUS)
     annuli = {
         float(edge): correlation(lowest, tilt, is_ball & (away >= edge) & (away < edge + ANNULUS)) for edge in edges if edge > 0.0
     }
-    return LayerMotion(motion, -float(full.fun), -float(shift.fun), annuli)
+    return LayerMotion(motion_of(lowest, tilt), -float(full.fun), -float(shift.fun), annuli)
 
 
 def ball_points(sensor: SensorSpec, u: np.ndarray, v: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:

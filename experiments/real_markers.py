@@ -8,13 +8,14 @@ darkness; what is compared is the difference of both photographs.
 
 A model is told the circle of the contact in ``0.png``, an option, from which follows the depth, at which the edge of the rigid pad's
 imprint is as wide; and the ball's own motion: displacement and turn by the dots within the circle, or with ``--layers`` displacement and
-tilt by the rings of a printed ball's layers (``layer_motion``), and the turn alone by the dots. Nothing else is fitted, unless a constant:
-a displacement that is the same for all dots (a gel that slides in its case), by least squares, and taken off the ball's motion.
+tilt by the rings of a printed ball's layers (``layer_motion``), and only the turn about z by the dots. Nothing else is fitted, unless a
+constant: a displacement that is the same for all dots (a gel that slides in its case), by least squares, and taken off the ball's motion.
 
-- ``markers.dots``, ``.lost``, ``.size_um``: dots compared and lost, root mean square of their motion; ``.ball_um``, ``.turn_deg``.
+- ``markers.dots``, ``.lost``, ``.size_um``: dots compared and lost, root mean square of their motion; ``.ball_um``, ``.turn_deg``: of those
+  under the ball; ``.detection_um``: change of the dots' motion by other thresholds of darkness, root mean square.
 - ``markers.MODEL.under_um``, ``….outside_um``: root mean square distance of dots under the ball, and of the others.
-- ``markers.layers.…`` with ``--layers``: displacement of the ball's lowest point and of its centre, its tilt, and the rings' correlation,
-  with the best motion, with the best that does not tilt, and by annulus.
+- ``markers.layers.…`` with ``--layers``: displacement of the ball's lowest point and of its centre, its tilt and turn, the correlation of
+  rings with the best motion, with the best that does not tilt, and by annulus; how far dots on it, ahead of its middle and behind, lag.
 - ``markers.MODEL.constant.smooth_…_um``: what is left of that error when a smooth motion of all dots is fitted to it too, on one half of
   the dots, and is taken off the other: a turn and a scale of the whole image, an affine and a quadratic motion. What a quadratic one
   leaves is local: errors of dots, and of the model near the ball.
@@ -22,8 +23,8 @@ a displacement that is the same for all dots (a gel that slides in its case), by
   component along the ball's motion alone.
 - ``markers.MODEL.constant.…``: the same with a constant, ``….x_um`` and ``….y_um`` its value. ``residuals.png`` shows what remains.
 
-``--vary NAME=A,B,…`` gives the gelpad each of some values, one property of ``VARIED``, with a constant. The value that is best on one half
-of the dots, every other one, is tested on the other half, whose dots had no part in it, nor in the constant:
+``--vary NAME=A,B,…`` gives the gelpad each of some values, one property of ``VARIED``, or the circle a radius, with a constant. The value
+that is best on one half of the dots, every other one, is tested on the other half, whose dots had no part in it, nor in the constant:
 
 - ``varied.MODEL.A.rms_um``, ``….first_um``, ``….second_um``: of all dots, and of each half with a constant of its own.
 - ``varied.MODEL.tested_first``, ``….tested_first_um``: the value chosen on the second half, and the first half's error with it and with
@@ -40,7 +41,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from experiments.drag_photographs import BallMotion, Drag, layer_motion, rigid_motion
+from experiments.drag_photographs import BallMotion, Drag, ball_points, detection_error, layer_motion, rigid_motion
 from experiments.running import recorded, run
 from raytac.calibrate import PressedBall, pressed_balls
 from raytac.checks import check_number
@@ -64,6 +65,8 @@ VARIED: dict[str, Callable[[GelpadSpec, str], GelpadSpec]] = {
     "bonded": lambda gel, value: replace(gel, bonded=value),
 }
 """Properties of the gelpad that may be varied; ``size`` is over the sensor's own."""
+RADIUS = "radius_px"
+"""Radius of the contact's circle, which may be varied too [px]."""
 UNDER = 0.9
 """Dots within so many radii of the circle's centre move with the ball."""
 
@@ -89,7 +92,7 @@ class Args(CommonOptions):
     layers: bool = False
     """Read the motion of a printed ball from the rings of its layers, and tell it to the models."""
     vary: str = ""
-    """Property of the gelpad and its values, as friction=0.3,0.5,1; see the module's text. None if empty."""
+    """Property of the gelpad, or radius_px, and its values, as friction=0.3,0.5,1; see the module's text. None if empty."""
 
 
 class Dragged:
@@ -161,6 +164,17 @@ def at_rest(sensor: SensorSpec, pixels: np.ndarray, seen: Callable[[np.ndarray],
     return np.column_stack([xy, rest_height(sensor.gelpad, *xy.T)])
 
 
+def over_ball(
+    sensor: SensorSpec, drag: Drag, circle: np.ndarray, centre: np.ndarray, radius: float, motion: BallMotion
+) -> tuple[np.ndarray, np.ndarray]:
+    """Dots within the circle [px], (N, 2), and how much farther each went than the ball at ``centre`` (3,) under it [px]."""
+    within = np.hypot(*(drag.before - circle[:2]).T) < circle[2]
+    u, v = drag.before[within].T
+    points = ball_points(sensor, u, v, centre, radius)
+    moved = camera_of(sensor).project(motion.of(points, centre)) - drag.before[within]
+    return drag.before[within], drag.motion[within] - moved
+
+
 def compared(
     drag: Drag, dragged: Dragged, config: MarkersConfig, own: BallMotion, with_constant: bool
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -197,14 +211,16 @@ def smooth_parts(places: np.ndarray, difference: np.ndarray) -> dict[str, float]
     return result
 
 
-def varied(gelpad: GelpadSpec, text: str) -> tuple[str, dict[str, GelpadSpec]]:
-    """Property of ``NAME=A,B,…``, and the gelpad with each of its values; errors as of the gelpad's own checks."""
+def varied(gelpad: GelpadSpec, circle: np.ndarray, text: str) -> tuple[str, dict[str, tuple[GelpadSpec, np.ndarray]]]:
+    """Property of ``NAME=A,B,…``, and the gelpad and the circle with each of its values; errors as of the gelpad's own checks."""
     name, _, values = text.partition("=")
-    parse_names(name, "vary", tuple(VARIED))
+    parse_names(name, "vary", (*VARIED, RADIUS))
     if len(set(values.split(","))) < 2:
         raise InputError("vary", value=text, rule="must name a property and two or more values, as friction=0.3,0.5,1")
     try:
-        return name, {value: VARIED[name](gelpad, value) for value in values.split(",")}
+        if name == RADIUS:
+            return name, {value: (gelpad, np.array([*circle[:2], float(value)])) for value in values.split(",")}
+        return name, {value: (VARIED[name](gelpad, value), circle) for value in values.split(",")}
     except ValueError as error:
         raise InputError("vary", value=text, rule=f"must have values that the property takes: {error}") from error
 
@@ -247,19 +263,26 @@ def main(args: Args) -> None:
     if under.sum() < 2:
         raise InputError("circle_px", value=args.circle_px, rule="must have at least two dots inside")
     seen, turn = rigid_motion(drag.before[under], drag.motion[under], circle[:2])
-    own, layers = BallMotion(seen * np.asarray(sensor.camera.pixel_pitch), turn=turn), None
+    own, layers, lag = BallMotion(seen * np.asarray(sensor.camera.pixel_pitch), turn=turn), None, {}
     if args.layers:
         assert ball.surface is not None
         place = ball.surface.contact_centre[0]
         centre = np.array([*place, radius - ball.depth + float(rest_height(sensor.gelpad, *place))])
         layers = layer_motion(drag.images, sensor, circle, centre, radius)
-        own = replace(layers.motion, turn=turn)
+        places, farther = over_ball(sensor, drag, circle, centre, radius, layers.motion)
+        own = replace(layers.motion, turn=rigid_motion(places, farther, circle[:2])[1])
+        axis = seen / np.hypot(*seen)
+        is_ahead = (places - circle[:2]) @ axis > 0.0
+        lag = {
+            f"lag_{name}_um": -float((farther[m] @ axis).mean()) * pitch_um
+            for name, m in (("ahead", is_ahead), ("behind", ~is_ahead))
+        }
     if args.vary:
-        name, gelpads = varied(sensor.gelpad, args.vary)
+        name, variants = varied(sensor.gelpad, circle, args.vary)
         pads = {}
-        for value, gelpad in gelpads.items():
+        for value, (gelpad, around) in variants.items():
             own_sensor = replace(sensor, gelpad=gelpad)
-            pads[value] = Dragged(own_sensor, pressed_ball(own_sensor, circle, radius, device), radius, args.level, device)
+            pads[value] = Dragged(own_sensor, pressed_ball(own_sensor, around, radius, device), radius, args.level, device)
         with recorded(args, "real_markers", device=device) as (_, metrics):
             for model in models:
                 metrics |= chosen_by_halves(drag, pads, model, name, own, pitch_um)
@@ -268,6 +291,7 @@ def main(args: Args) -> None:
     with recorded(args, "real_markers", device=device) as (folder, metrics):
         size = _rms(drag.motion) * pitch_um
         metrics |= {"markers.dots": len(drag.before), "markers.lost": drag.lost, "markers.size_um": size}
+        metrics["markers.detection_um"] = detection_error(drag) * pitch_um
         metrics |= {"markers.ball_um": float(np.hypot(*seen)) * pitch_um, "markers.turn_deg": float(np.degrees(turn))}
         metrics |= {
             "markers.depth_mm": 1e3 * ball.depth,
@@ -275,7 +299,7 @@ def main(args: Args) -> None:
             "markers.level": args.level,
         }
         if layers is not None:
-            figures = layers.figures(radius)
+            figures = layers.figures(radius) | {"turn_deg": float(np.degrees(own.turn))} | lag
             metrics |= {f"markers.layers.{name}": value for name, value in figures.items()}
             print("layers: " + ", ".join(f"{name} {value:.4g}" for name, value in figures.items()), flush=True)
         residuals = {}

@@ -1,11 +1,13 @@
 """What do substeps and tolerances of soft worlds change in the forces, and what do they cost?
 
     python experiments/soft_world_accuracy.py --device cpu --out runs/soft_world_accuracy
+    python experiments/soft_world_accuracy.py --still --envs 1 --device cpu --out runs/soft_world_accuracy_still
 
 A pad comes down on a cube or a ball and holds it with about 1 N while it is moved to and fro (``bench_rl.py``'s policy). The actions of the
 first run are repeated with each of ``ACCURACIES``. Keys ``soft_world.<task>.<accuracy>.<key>``: iterations ``newton`` and ``linear`` of an
 environment in a control step, its ``solves`` and the ``solves_most`` of any environment, and ``force_error``: root mean square of the
 change of the force on the pad against ``fine``, over the mean force, once the pad has landed. That of ``finer`` says how exact ``fine`` is.
+With ``--still`` the pad is only pressed on, and not moved to and fro.
 """
 
 from __future__ import annotations
@@ -43,6 +45,8 @@ class Args(CommonOptions):
     """Environments, each with actions of its own."""
     steps: int = 28
     """Control steps, from a pad in the air on."""
+    still: bool = False
+    """Do not move the pad to and fro."""
 
 
 def main(args: Args) -> dict[str, Metric]:
@@ -79,7 +83,7 @@ def play(task: str, accuracy: SceneSettings, actions: np.ndarray | None, args: A
     for step in range(args.steps):
         if actions is None:
             force = -env.batch.world.state().wrench["sensor"][:, 2]
-            action = rng.uniform(-0.1, 0.1, (args.envs, size))
+            action = (not args.still) * rng.uniform(-0.1, 0.1, (args.envs, size))
             action[:, 2] = np.where(force > 0.0, np.clip(gain * (force - 1.0), -1.0, 1.0), -0.3)
         else:
             action = actions[step]

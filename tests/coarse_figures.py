@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import sys
 from functools import wraps
+from pathlib import Path
 from typing import Any
 
 from tests.on_import import change_module
 
 MOST = 100.0
 """Most dots per inch of a figure that a test saves."""
+asked: dict[str, float] = {}
+"""Dots per inch that a file of each name was last to be saved with, in this process."""
 
 
 def limit() -> None:
@@ -25,6 +28,8 @@ def _limit(module: Any) -> None:
     @wraps(save)
     def coarse(figure: Any, *args: Any, dpi: Any = None, **options: Any) -> None:
         own = sys.modules["matplotlib"].rcParams["savefig.dpi"] if dpi is None else dpi
-        save(figure, *args, dpi=min(MOST, figure.dpi if own == "figure" else own), **options)
+        dots = figure.dpi if own == "figure" else own
+        asked.update({Path(path).name: dots for path in args[:1] if isinstance(path, str | Path)})
+        save(figure, *args, dpi=min(MOST, dots), **options)
 
     module.Figure.savefig = coarse

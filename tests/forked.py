@@ -102,10 +102,11 @@ def _server() -> subprocess.Popen[str]:
     server = subprocess.Popen(command, cwd=ROOT, env=environment, start_new_session=True, **pipes)
 
     def end() -> None:
-        assert server.stdin is not None
+        assert server.stdin is not None and server.stdout is not None
         if server.poll() is None:
             server.stdin.close()  # it ends when it reads no more
             server.wait()
+        server.stdout.close()
 
     atexit.register(end)
     return server

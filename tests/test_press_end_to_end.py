@@ -15,6 +15,7 @@ from raytac.frame import TactileFrame
 from raytac.io.images import read_exr, read_png
 from raytac.io.metrics import read_metrics
 from raytac.specs import load_sensor
+from tests import coarse_figures
 
 ROOT = Path(__file__).parents[1]
 LAYERS = ("red", "green", "blue")
@@ -33,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_file_is_there(folder: Path) -> None:
     assert {path.name for path in folder.iterdir()} == FILES
     preview = read_png(folder / "preview.png")
-    assert preview.shape[1] > 1000 and preview.std() > 20
+    assert preview.shape[1] > 7.0 * coarse_figures.MOST and preview.std() > 20
 
 
 def test_exr_has_the_documented_channels_and_its_layers_sum_to_the_image(folder: Path) -> None:

@@ -20,6 +20,12 @@ CLOSER = 0.6, 2.5
 """Range of a fitted distance from pinhole to pad, over that of the start (a guess)."""
 MOST_DISTORTED, MOST_K1 = 0.1, 1.9
 """Most of the size of a fitted distortion (a guess), and of its k1."""
+VIEW = "distance", "distortion"
+"""Blocks of a fit's parameters that are its view."""
+SPREAD = 0.2
+"""Least distance of presses from the optical axis (a guess).
+
+It is a root mean square, over half the image's longer side."""
 ROUNDED = 1e-3
 """Most that a start may lie beyond a bound: numbers of a file are rounded."""
 _MARGIN = 1e-4
@@ -40,6 +46,16 @@ def view_of(sensor: SensorSpec) -> np.ndarray:
 
 def _view(camera: CameraSpec) -> tuple[float, float]:
     return -1e3 * camera.position[2], camera.distortion[0] * _half_view(camera) ** 2
+
+
+def tells_view(sensor: SensorSpec, circles: np.ndarray) -> bool:
+    """True if presses at ``circles`` (N, 3) [px] lie far enough from the optical axis.
+
+    Parallax and distortion, which tell a view, grow with the distance from the axis. Near it other errors of the imprint pass for them.
+    """
+    camera = sensor.camera
+    away = np.asarray(circles)[:, :2] - camera.principal_point
+    return bool(np.sqrt((away**2).sum(1).mean()) >= SPREAD * 0.5 * max(camera.resolution))
 
 
 def with_view(sensor: SensorSpec, view: np.ndarray) -> SensorSpec:

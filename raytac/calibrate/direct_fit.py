@@ -271,11 +271,16 @@ class DirectFit:
 
     def _linear(self, p: LightParameters, total: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Light [full scales] that is encoded: pressed (M, 3), at rest (K, 3); stray light (3,)."""
-        gamma, *stray, a1, a2 = p.response
+        gamma, *stray = p.response[:4]
         black = np.array(stray) * darkest(self.darkest, gamma, p.curve)
         pressed, flat, rest = total
         linear = (decode(self.behind, gamma, p.curve) - black) * pressed / flat + black
-        return linear, rest * (1 + self.r2 * (a1 + a2 * self.r2)) + black, black
+        return linear, rest * self._vignette(p) + black, black
+
+    def _vignette(self, p: LightParameters) -> np.ndarray:
+        """The vignette over the image at rest, (K, 1)."""
+        a1, a2 = p.response[4:]
+        return 1 + self.r2 * (a1 + a2 * self.r2)
 
     def lack(self, p: LightParameters, total: list[np.ndarray]) -> np.ndarray:
         """Light at rest that is below the least share, over its channel's mean, (K, 3) [levels]."""
@@ -458,8 +463,9 @@ class DirectFit:
     def _gains(self, p: LightParameters, total: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Slopes of levels by light pressed, by light at rest (negated), and of the rest image."""
         linear, rest, black = self._linear(p, total)
-        lit, still = (level_slope(light, p.response[0], p.curve) * (light - black) for light in (linear, rest))
-        return lit / total[0], lit / total[1], still / total[2]
+        slope, still = (level_slope(light, p.response[0], p.curve) for light in (linear, rest))
+        lit = slope * (linear - black)
+        return lit / total[0], lit / total[1], still * self._vignette(p)
 
     def step(self, state: FitState) -> Callable[[float], FitState]:
         """The normal equations at ``state``; the result gives the trial state of any damping."""

@@ -230,6 +230,34 @@ def led_slopes(seen: PixelGeometry, led: np.ndarray, points: EdgePoints, referen
     return LedLight(light, by_led, by_normal)
 
 
+@dataclass(frozen=True)
+class LightFrom:
+    """Light of a place on an LED's longer edge, and the edges that go with it."""
+
+    light: np.ndarray
+    """(M,), with the density of the place."""
+    d: np.ndarray
+    """From the points to the place [m], (3, M)."""
+    halves: np.ndarray
+    """Its part of half the longer edge, and half the shorter one [m], (2, 3, M)."""
+
+
+def light_by_place(seen: PixelGeometry, led: np.ndarray, count: int, reference: float) -> list[LightFrom]:
+    """Light of ``count`` places on the longer edge of ``led``, amid the shorter one."""
+    frame, halves = _Frame.of(*led[3:5]), (0.5e-3 * led[7], 0.5e-3 * led[6])
+    long = int(halves[1] * np.hypot(*frame.edges[1][:2]) > halves[0] * np.hypot(*frame.edges[0][:2]))
+    (e, f), (half, other) = (frame.edges[long], frame.edges[1 - long]), (halves[long], halves[1 - long])
+    q = 1e-3 * led[:3, None] - seen.p
+    foot = e @ q
+    distance = np.sqrt(np.maximum(np.einsum("km,km->m", q, q) - foot * foot, 1e-12))
+    result = []
+    for place in _Edge(foot, distance, half, count).places():
+        d = q + e[:, None] * place.x
+        own = np.stack([half * e[:, None] * place.density, np.repeat(other * f[:, None], len(foot), axis=1)])
+        result.append(LightFrom(place.density * _PointLight(seen, d, frame, led[5], reference).light, d, own))
+    return result
+
+
 def case_light(seen: PixelGeometry) -> np.ndarray:
     """Irradiance (M,) of a case of radiance 1 / π: its share of the hemisphere, (1 − n_z) / 2."""
     return 0.5 * (1 - seen.n[2])

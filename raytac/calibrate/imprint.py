@@ -19,9 +19,9 @@ from raytac.errors import InputError
 from raytac.gel.surface import GelSurface, PadGrid, rest_height
 from raytac.specs.sensor import CameraSpec, SensorSpec
 
-KNOTS = np.array([0.0, 0.3, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5, 1.75, 2.0, 2.4, 3.0])
+KNOTS = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.35, 1.5, 1.75, 2.0, 2.4, 3.0])
 """Distances over the contact radius between which the slope is linear; 0 at both ends."""
-RIGID_PAD = np.array([0.3, 0.6, 0.7, 0.8, 0.9, 0.86, 0.49, 0.39, 0.26, 0.16, 0.05, 0.01, 0.0])
+RIGID_PAD = np.array([0.1, 0.2, 0.3, 0.45, 0.6, 0.7, 0.8, 0.9, 0.86, 0.49, 0.39, 0.26, 0.16, 0.05, 0.01, 0.0])
 """s at the inner knots where a fit starts.
 
 They are about the rigid pad's at the depth where its contact is as wide as the circle (docs/concepts/rigid-pad.md)."""
@@ -152,6 +152,49 @@ def _facing(x: np.ndarray, y: np.ndarray, z: np.ndarray, zx: np.ndarray, zy: np.
     """Points whose normals, by the slopes ``zx`` and ``zy``, look to the camera."""
     n = np.stack([zx, zy, -np.ones_like(x)])
     return PixelGeometry(np.stack([x, y, z]), n / np.sqrt(zx * zx + zy * zy + 1))
+
+
+@dataclass(frozen=True)
+class PressedCoat:
+    """Coat under the ball of each of M pixels.
+
+    ``x`` and ``y`` of the ball's axis, ``radius`` of the contact [m], (M,) each.
+    """
+
+    sensor: SensorSpec
+    x: np.ndarray
+    y: np.ndarray
+    radius: np.ndarray
+    _press: np.ndarray
+    _profiles: np.ndarray
+
+    @classmethod
+    def of(
+        cls, sensor: SensorSpec, press: np.ndarray, circles: np.ndarray, ball_radius: np.ndarray, slopes: np.ndarray
+    ) -> PressedCoat:
+        """That of the presses ``press`` (M,), as ``pixel_geometry``."""
+        on_pad = circles_on_pad(sensor, circles, ball_radius)
+        x, y, radius = on_pad[press].T
+        return cls(sensor, x, y, radius, press, _heights(slopes, on_pad[:, 2] / ball_radius))
+
+    def from_axis(self, p: np.ndarray, ux: np.ndarray, uy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distance along (ux, uy) from ``p`` (3, M) to where its line is nearest to the axis.
+
+        And the square of the distance between line and axis; (M,) each.
+        """
+        dx, dy = self.x - p[0], self.y - p[1]
+        ahead = dx * ux + dy * uy
+        return ahead, dx * dx + dy * dy - ahead * ahead
+
+    def height(self, x: np.ndarray, y: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+        """z [m] of the coats of K pixels, ``pixel`` (K,), at x and y (K, S)."""
+        a = self.radius[pixel, None]
+        t = np.hypot(x - self.x[pixel, None], y - self.y[pixel, None]) / a
+        place = np.minimum(t / (_TABLE[1] - _TABLE[0]), len(_TABLE) - 1.001)
+        k = place.astype(int)
+        part, flat = place - k, self._profiles.ravel()
+        k += self._press[pixel, None] * len(_TABLE)
+        return -self.sensor.gelpad.sag(x, y) - a * (flat[k] * (1 - part) + flat[k + 1] * part)
 
 
 def press_surface(

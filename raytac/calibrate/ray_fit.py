@@ -15,17 +15,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from raytac.calibrate.camera_view import with_view
+from raytac.calibrate.camera_view import VIEW, tells_view, with_view
+from raytac.calibrate.cast_shadow import shadow_slopes, solve_shadowed
 from raytac.calibrate.direct_fit import REST_FACTOR, SIGMA, DirectFit, FitSettings, FitState
 from raytac.calibrate.direct_light import ExtraLight, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
-from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LENGTH, SHORTEST, LightParameters, with_parameters
+from raytac.calibrate.light_parameters import LightParameters, with_parameters
 from raytac.calibrate.photographs import Photographs, decode, shrunk
 from raytac.errors import InputError, SpecError
 from raytac.gel.surface import GelSurface, PadGrid, make_grid
 from raytac.optics.base import casts_shadows
 from raytac.optics.trace.config import RayTraced
-from raytac.optics.trace.shadow import EXTENDED, angle
 from raytac.specs import SensorSpec
 from raytac.specs.sensor_check import validate_sensor
 
@@ -35,12 +35,10 @@ FACTOR = 2
 """Presses are fitted, and rendered, as means of so many pixels squared."""
 FIRST, LATER = 100, 30
 """Most solver steps with direct light alone, and in each round with the ray tracer's."""
+UNSHADED = 15
+"""Those with direct light alone where shadows are cast: LEDs go astray without them."""
 START_SPREAD = np.array([1.5, 1.5, 1.0, 0.2, 0.2, 0.5, 0.0, 0.0])
 """Standard deviation of the starts: mm, rad, lobe exponent, mm."""
-STEPS = {0: 0.4, 1: 0.4, 2: 0.4, HEIGHT: 0.5, LENGTH: 1.0}
-"""Steps [mm] of slopes by an LED's place and size; shadows' soft edges are as wide."""
-LEAST = {HEIGHT: HEIGHTS[0], LENGTH: SHORTEST}
-"""Least size [mm] that is rendered for a slope."""
 FEWEST = 4
 """Fewest presses that a fit takes."""
 HOLD, HOLD_FACTOR = 1000.0, 8.0
@@ -110,29 +108,11 @@ def defect(problem: DirectFit, state: FitState, grid: PadGrid, device: str, trac
 def extra_light(
     problem: DirectFit, state: FitState, grid: PadGrid, device: str, tracing: RayTraced, *, slopes: bool = True
 ) -> ExtraLight:
-    """The defect, and its slopes by the LEDs' places and sizes.
+    """The defect, and where shadows are cast and ``slopes`` is asked for, those of shadows.
 
-    Slopes by lengths where an LED is extended; all where shadows are cast and ``slopes`` is asked for. Every LED has a layer of its own,
-    so that all move in one rendering: eight or ten more give all slopes, by central differences and without inter-reflection, which
-    changes slowly.
+    Inter-reflection changes slowly with the LEDs' places, and has none.
     """
-    lights: dict[int, Light] = {}
-    if slopes and casts_shadows(problem.sensor, tracing.shadows):
-        direct = dataclasses.replace(tracing, bounce=False)
-        extended = any(angle(led) > EXTENDED for led in state.p.lights(problem.sensor).leds)
-        for k, step in STEPS.items():
-            if k == LENGTH and not extended:
-                continue
-            ends = [state.p.leds.copy(), state.p.leds.copy()]
-            for leds, offset in zip(ends, (-step, step), strict=True):
-                leds[:, k] += offset
-                if k in LEAST:
-                    leds[:, k] = np.maximum(leds[:, k], LEAST[k])  # a size below 0 is that above
-            apart = (ends[1][:, k] - ends[0][:, k])[:, None, None]
-            states = [dataclasses.replace(state, p=dataclasses.replace(state.p, leds=leds)) for leds in ends]
-            # With the tracer's own points, so that a step to another number of them is no slope of shadows.
-            below, above = (defect(problem.with_points(moved.p.points), moved, grid, device, direct) for moved in states)
-            lights[k] = Light(*((b - a) / apart for a, b in zip(below.parts, above.parts, strict=True)))
+    lights = shadow_slopes(problem, state) if slopes and casts_shadows(problem.sensor, tracing.shadows) else {}
     return ExtraLight(defect(problem, state, grid, device, tracing), state.p.leds.copy(), lights)
 
 
@@ -153,11 +133,16 @@ def fit_lights(
 
     ``start``: where the fit begins; None is ``first_state``. ``rounds`` of defect correction follow the fit of direct light; 0 leaves it
     at that. Direct light is fitted from ``starts`` places, the given one and others about it, and the best goes on. ``seed`` chooses
-    pixels and places. ``tick`` is called with the stage and the cost after every step. Raises InputError: refraction, a camera with
+    pixels and places. The view is held at the given one where presses lie near the optical axis (``tells_view``), or where its distance
+    ends at a bound. ``tick`` is called with the stage and the cost after every step. Raises InputError: refraction, a camera with
     tilt or without colours, LEDs of no colour, a colour matrix, tone curve or distortion outside its bounds that is not fixed,
     fewer values than parameters, or an end that no sensor file may hold; BackendError: the ray tracer cannot run on ``device``.
     """
     settings = FitSettings() if settings is None else settings
+    keeping_view = dataclasses.replace(settings, fixed=tuple(dict.fromkeys((*settings.fixed, *VIEW))))
+    if settings != keeping_view and not tells_view(sensor, shots.circles):
+        _LOG.info("these presses lie too near to the optical axis to tell the camera's view, which stays as given")
+        settings = keeping_view
     if sensor.refraction.model != "none":
         raise InputError("refraction.model", value=sensor.refraction.model, rule="cannot be fitted", choices=("none",))
     if sensor.camera.lens.tilts or sensor.camera.monochrome:
@@ -174,14 +159,33 @@ def fit_lights(
         return lambda _, cost: tick(stage, cost) if tick is not None else None
 
     rng, results, errors = np.random.default_rng(seed), [], []
+    shaded = casts_shadows(sensor, (tracing or RayTraced()).shadows)
     for k in range(starts):
         first = begin if k == 0 else brightened(problem, _perturbed(problem, begin, rng))
-        own, here = solve_direct(problem, first, FIRST, report(f"direct light, start {k + 1} of {starts}"))
+        own, here = solve_direct(
+            problem, first, UNSHADED if shaded else FIRST, report(f"direct light, start {k + 1} of {starts}")
+        )
         off = own.residuals(here)
         results.append((own.cost(here, off), here))
         errors.append(float(np.abs(off[0][problem.inside]).mean()))
     _, state = min(results, key=lambda pair: pair[0])
+
+    def with_given_view() -> Fitted:
+        _LOG.warning(
+            "the camera's distance ended at its bound, %.4g mm (given: %.4g mm): these presses do not tell the view. "
+            "It stays as given, and all else is fitted again",
+            state.p.view[0],
+            begin.p.view[0],
+        )
+        options = {"start": start, "rounds": rounds, "starts": starts, "device": device, "seed": seed, "tracing": tracing}
+        return fit_lights(sensor, shots, settings=keeping_view, tick=tick, **options)
+
+    if _is_at_bound(problem, state):
+        return with_given_view()
     problem = problem.with_points(state.p.smooth_points)
+    if shaded:
+        state = solve_shadowed(problem, state, report("direct light with shadows"))
+        problem = problem.with_points(state.p.smooth_points)
     grid, costs, hold = make_grid(sensor.gelpad, GRID_PITCH), [], 0.0
     if not rounds:
         costs.append(problem.cost(state, problem.residuals(state)))
@@ -199,7 +203,8 @@ def fit_lights(
             held = best[0].near(best[1], hold)
             state = held.solve(best[1], LATER, report(f"all light, round {k + 1} of {rounds}"))
     _, state = best
-    _warn_of_bound(problem, state)
+    if _is_at_bound(problem, state):
+        return with_given_view()
     fitted = with_parameters(sensor, state.p, shots.background)
     check_fitted(fitted)
     return Fitted(fitted, state, tuple(costs), tuple(errors))
@@ -214,19 +219,12 @@ def check_fitted(sensor: SensorSpec) -> None:
         raise InputError("sensor", value=sensor.name, rule=rule) from error
 
 
-def _warn_of_bound(problem: DirectFit, state: FitState) -> None:
-    """Log a warning where presses did not determine the camera's distance."""
+def _is_at_bound(problem: DirectFit, state: FitState) -> bool:
+    """True if the camera's distance was fitted and lies at its bound."""
     fixed, distance = problem.settings.fixed, float(state.p.view[0])
     if "distance" in fixed:
-        return
-    for bound in problem.views.distances("distortion" in fixed):
-        if abs(distance - bound) <= _AT_BOUND * bound:
-            _LOG.warning(
-                "the camera's distance ended at its bound, %.4g mm (start %.4g mm): these presses do not determine the view. "
-                "Take presses all over the pad, or fix 'distance' and 'distortion'",
-                distance,
-                problem.start.p.view[0],
-            )
+        return False
+    return any(abs(distance - bound) <= _AT_BOUND * bound for bound in problem.views.distances("distortion" in fixed))
 
 
 def solve_direct(

@@ -160,7 +160,7 @@ class DeviceMode(ABC):
         # A copy: an array on NumPy memory that a surface shares would be one input twice for a recording.
         self._rest = self.mi.Float(concave_cover(grid).astype(np.float32).ravel())
         self._inputs = FrameInputs(self._rest, self._build(grid))
-        self._grid = grid
+        self._grid, self._rest_heights = grid, grid.rest.astype(np.float32)
 
     def memory_per_env(self, grid: PadGrid) -> int:
         """Most device memory that an environment of a batch on ``grid`` takes [byte]."""
@@ -250,7 +250,7 @@ class DeviceMode(ABC):
 
         The others show the image at rest: their gel is untouched, and their dots are where the first pad at rest had them.
         """
-        rest = surface.grid.rest.astype(np.float32)
+        rest = self._rest_heights
         differ = failed | surface.contact.any(axis=(1, 2))
         untouched = np.flatnonzero(~differ)
         differ[untouched] = (heights[untouched] != rest).any(axis=(1, 2))

@@ -31,6 +31,12 @@ _RAYS = 33
 """Camera rays along a side of the image that tell which nodes are in view."""
 
 
+def clipped(x: Any, most: float) -> Any:
+    """``x`` within [0, most] by comparisons, which take less than minima that keep NaN."""
+    x = dr.select(x > 0, x, 0)
+    return dr.select(x < most, x, most)
+
+
 def bilinear(corners: Sequence[Any], wx: Any, wy: Any) -> Any:
     """Bilinear mean of a cell's ``corners`` at the shares ``wx`` and ``wy`` of its sides."""
     a, b, c, d = corners
@@ -54,7 +60,7 @@ class NodeGrid:
 
     def cell_at(self, mi: Any, env: Any, fx: Any, fy: Any) -> tuple[Any, Any, Any]:
         """The same of a place in columns and rows from the first node."""
-        fx, fy = dr.clip(fx, 0, self.nx - 1.001), dr.clip(fy, 0, self.ny - 1.001)
+        fx, fy = (clipped(f, n - 1.001) for f, n in ((fx, self.nx), (fy, self.ny)))
         ix, iy = mi.UInt32(fx), mi.UInt32(fy)
         return env * (self.ny * self.nx) + (iy * self.nx + ix), fx - mi.Float(ix), fy - mi.Float(iy)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -91,7 +92,17 @@ def _pins(spec: Shape) -> tuple[Part, ...]:
 def _coin(spec: Shape) -> tuple[Part, ...]:
     radius, thickness, relief = (_length(spec, key) for key in ("radius", "thickness", "relief_height"))
     body = primitive("cylinder", (radius, 0.5 * thickness), _shift(0.0, 0.0, 0.5 * thickness))
-    return body, replace(relief_part(coin_elevation(radius, relief), radius), joined=True)
+    return body, _coin_face(radius, relief)
+
+
+@lru_cache(1)
+def _coin_face(radius: float, relief: float) -> Part:
+    """Relief of a coin; that of the last size is kept, since it has a million triangles."""
+    face = replace(relief_part(coin_elevation(radius, relief), radius), joined=True)
+    for values in (face.elevation, face.vertices, face.faces):
+        assert values is not None
+        values.setflags(write=False)
+    return face
 
 
 def _heights(spec: ObjectSpec) -> Part:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from raytac.calibrate.light_parameters import CHANNELS
 from raytac.calibrate.photographs import FAR, Photographs
 from raytac.errors import BackendError
 from raytac.report.image_error import psnr, rmse, ssim_map
@@ -22,8 +23,9 @@ BOX_MARGIN = 15
 def press_scores(sensor: SensorSpec, images: np.ndarray, shots: Photographs) -> list[dict[str, float]]:
     """Errors of ``images`` (N, H, W, 3) [levels] by press, at labelled circles.
 
-    MAE and RMSE [levels] in the disc, MAE in the ring from one to two radii, PSNR [dB] and SSIM in the box of the circle and
-    ``BOX_MARGIN`` px, MAE over the frame. SSIM is left out where scikit-image is not installed.
+    MAE and RMSE [levels] in the disc, MAE in the ring from one to two radii, also by channel, PSNR [dB] and SSIM in the box of the circle
+    and ``BOX_MARGIN`` px, MAE over the frame. ``ring_even``: size of the ring's median error, the mean over channels; what a change of the
+    whole ring's level would take away. SSIM is left out where scikit-image is not installed.
     """
     scores = []
     height, width = shots.background.shape[:2]
@@ -31,13 +33,16 @@ def press_scores(sensor: SensorSpec, images: np.ndarray, shots: Photographs) -> 
         images.astype(float), shots.presses.astype(float), shots.distance(sensor), shots.circles, strict=True
     ):
         off = np.abs(image - real)
+        ring = (rho >= 1) & (rho < 2)
         x_low, x_high = (int(np.clip(e, 0, width)) for e in (x - r - BOX_MARGIN, x + r + BOX_MARGIN + 1))
         top, bottom = (int(np.clip(e, 0, height)) for e in (y - r - BOX_MARGIN, y + r + BOX_MARGIN + 1))
         box = np.s_[top:bottom, x_low:x_high]
         score = {
             "contact_mae": float(off[rho < 1].mean()),
             "contact_rmse": float(np.sqrt((off[rho < 1] ** 2).mean())),
-            "ring_mae": float(off[(rho >= 1) & (rho < 2)].mean()),
+            "ring_mae": float(off[ring].mean()),
+            **{f"ring_mae_{name}": float(off[ring, c].mean()) for c, name in enumerate(CHANNELS)},
+            "ring_even": float(np.abs(np.median((image - real)[ring], axis=0)).mean()),
             "box_psnr": psnr(rmse(image[box], real[box])),
             "frame_mae": float(off.mean()),
         }

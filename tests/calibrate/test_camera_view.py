@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from raytac.calibrate.camera_view import ViewBounds, view_of, with_view
+from raytac.calibrate.camera_view import ViewBounds, tells_view, view_of, with_view
 from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
 from raytac.calibrate.imprint import RIGID_PAD
 from raytac.calibrate.light_parameters import LightParameters, with_parameters
@@ -16,6 +16,7 @@ from raytac.calibrate.photographs import Photographs
 from raytac.calibrate.ray_fit import check_fitted, fit_lights
 from raytac.calibrate.start import leds_at_walls, leds_in_rows
 from raytac.errors import InputError
+from raytac.optics import RayTraced
 from raytac.specs import SensorSpec, load_sensor, with_lights
 from raytac.specs.sensor_check import view_edges
 from raytac.specs.sensor_file import lights_text, sensor_files
@@ -143,25 +144,53 @@ def test_a_camera_whose_view_stays_keeps_its_numbers(name: str) -> None:
 
 
 @pytest.mark.parametrize("at_bound", [True, False])
-def test_a_distance_that_ends_at_its_bound_is_logged(
+def test_a_distance_that_ends_at_its_bound_is_not_taken(
     at_bound: bool, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The end of the solver is given here; the warning says where it lies and what to do."""
+    """The end of the solver is given here: at a bound, all else is fitted again with the given view, and the log says why."""
     mini = load_sensor("gelsight_mini")
     at = circles(8)
     blank = Photographs(np.full((240, 320, 3), 90.0), np.full((8, 240, 320, 3), 90.0), at, np.full(8, 3.155e-3))
-    distance = 28.0 * (2.5 if at_bound else 1.2)
+    distance, fixed = 28.0 * (2.5 if at_bound else 1.2), []
 
     def solve(problem: DirectFit, state: FitState, *_: object) -> tuple[DirectFit, FitState]:
-        view = np.array([distance, 0.0])
+        fixed.append(problem.settings.fixed)
+        view = state.p.view if "distance" in fixed[-1] else np.array([distance, 0.0])
         return problem, problem.inside_bounds(dataclasses.replace(state, p=dataclasses.replace(state.p, view=view)))
 
     monkeypatch.setattr("raytac.calibrate.ray_fit.solve_direct", solve)
     with caplog.at_level("WARNING", "raytac"):
-        fitted = fit_lights(mini, blank, settings=FitSettings(fixed=("tone", "mix")), rounds=0, starts=1, device="cpu")
-    assert fitted.state.p.view[0] == pytest.approx(distance)
-    said = "the camera's distance ended at its bound, 70 mm (start 28 mm)" in caplog.text and "fix 'distance'" in caplog.text
+        options = {"settings": FitSettings(fixed=("tone", "mix")), "rounds": 0, "starts": 1, "tracing": RayTraced(shadows=False)}
+        fitted = fit_lights(mini, blank, device="cpu", **options)
+    said = "the camera's distance ended at its bound, 70 mm (given: 28 mm)" in caplog.text
     assert said == at_bound
+    if at_bound:
+        assert fixed == [("tone", "mix"), ("tone", "mix", "distance", "distortion")] and fitted.sensor.camera == mini.camera
+    else:
+        assert fixed == [("tone", "mix")] and fitted.state.p.view[0] == pytest.approx(distance)
+
+
+def test_presses_near_the_optical_axis_leave_the_view_as_given(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever they would end at: parallax and distortion grow with the distance from the axis."""
+    mini = load_sensor("gelsight_mini")
+    at = circles(8)
+    assert tells_view(mini, at)
+    at[:, :2] = 0.2 * (at[:, :2] - at[:, :2].mean(0)) + mini.camera.principal_point
+    assert not tells_view(mini, at)
+    grey = np.full((240, 320, 3), 90.0)
+    fixed = []
+
+    def solve(problem: DirectFit, state: FitState, *_: object) -> tuple[DirectFit, FitState]:
+        fixed.append(problem.settings.fixed)
+        return problem, state
+
+    monkeypatch.setattr("raytac.calibrate.ray_fit.solve_direct", solve)
+    shots = Photographs(grey, np.repeat(grey[None], 8, axis=0), at, np.full(8, 3.155e-3))
+    with caplog.at_level("INFO", "raytac"):
+        fit_lights(mini, shots, settings=FitSettings(fixed=("tone",)), rounds=0, starts=1, tracing=RayTraced(shadows=False))
+    assert fixed == [("tone", "distance", "distortion")] and "too near to the optical axis" in caplog.text
 
 
 def test_a_fit_that_ends_in_no_sensor_says_what_to_do() -> None:

@@ -43,6 +43,7 @@ def test_quick_run_measures_everything_and_keeps_its_reference(
     assert numbers["bvh.cpu.rebuild_ms"] > 0 and numbers["memory.growth_mb_50"] < 20
     assert 0 < numbers["import_raytac_s"] < numbers["first_image_s"] < numbers["first_image_process_s"]
     assert read_png(tmp_path / "pareto.png").shape[1] == round(3.5 * coarse_figures.MOST)
+    assert coarse_figures.asked["pareto.png"] == 300
     assert "fast.cpu.80x60.psnr_db = " in capsys.readouterr().out
 
     kept = list((tmp_path / "references").iterdir())

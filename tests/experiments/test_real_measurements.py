@@ -122,6 +122,40 @@ def test_a_ball_is_seen_where_its_points_are_projected() -> None:
     assert np.isnan(ball_points(sensor, np.array([20.0]), np.array([20.0]), centre, BALL)).all()
 
 
+def test_a_turn_by_dots_is_what_the_balls_motion_leaves(dots: np.ndarray) -> None:
+    """Dots of a ball that moves, tilts and turns: the turn is read, whatever the rest of the motion; dots beside it do not matter."""
+    sensor = real_markers.photographed(load_sensor("gelsight_mini"), SIZE, PITCH / 1e3)
+    centre, motion = np.array([-0.5e-3, 0.0, 1.6e-3]), BallMotion(np.array([0.1e-3, 0.5e-3]), np.array([0.04, 0.06]))
+    circle = np.array([*camera_of(sensor).project(centre - [0.0, 0.0, BALL]), 44.0])
+    within = np.hypot(*(dots - circle[:2]).T) < circle[2]
+    u, v = dots[within].T
+    points = ball_points(sensor, u, v, centre, BALL)
+    after = dots.copy() + 3.0
+    x, y = (dots[within] - circle[:2]).T
+    after[within] = camera_of(sensor).project(motion.of(points, centre)) + 0.02 * np.column_stack([-y, x])
+    drag = drag_photographs.Drag(dots, after, 0, SIZE)
+    places, farther = real_markers.over_ball(sensor, drag, circle, centre, BALL, motion)
+    np.testing.assert_array_equal(places, dots[within])
+    moved, turn = drag_photographs.rigid_motion(places, farther, circle[:2])
+    assert turn == pytest.approx(0.02, abs=1e-9) and np.abs(moved).max() < 1e-9
+
+
+def test_detection_is_judged_by_other_thresholds(dots: np.ndarray) -> None:
+    """Clean dots hardly depend on them; with a grey spot beside each, which stays where it was, they do."""
+    after = dots + np.array([0.4, 1.3])
+    clean = photograph(dots), photograph(after)
+    spoilt = tuple(image.copy() for image in clean)
+    for image in spoilt:
+        for x, y in (dots + np.array([2.0, 0.0])).astype(int):
+            image[y - 4 : y + 5, x : x + 6] = 125
+    errors = []
+    for images in (clean, spoilt):
+        before, later = (drag_photographs.dot_centres(image, at)[0] for image, at in zip(images, (dots, after), strict=True))
+        errors.append(drag_photographs.detection_error(drag_photographs.Drag(before, later, 0, SIZE, images)))
+    print(errors)
+    assert errors[0] < 0.1 and 1.5 * errors[0] < errors[1]
+
+
 def test_smooth_parts_name_the_motion_that_explains_a_difference(dots: np.ndarray) -> None:
     x, y = ((dots - dots.mean(axis=0)) / 100.0).T
     turned = np.column_stack([0.3 - 0.5 * y + 0.2 * x, 0.1 + 0.5 * x + 0.2 * y])
@@ -134,7 +168,13 @@ def test_smooth_parts_name_the_motion_that_explains_a_difference(dots: np.ndarra
     assert all(rms > 0.98 * np.sqrt((noise**2).sum(axis=1).mean()) for rms in real_markers.smooth_parts(dots, noise).values())
 
 
-UNKNOWN = ("vary", "colour=1,2"), ("vary", "friction=1"), ("vary", "friction=a,b"), ("vary", "bonded=back,glue")
+UNKNOWN = (
+    ("vary", "radius_px=40,a"),
+    ("vary", "colour=1,2"),
+    ("vary", "friction=1"),
+    ("vary", "friction=a,b"),
+    ("vary", "bonded=back,glue"),
+)
 """Variations of the gelpad that are refused."""
 
 

@@ -124,3 +124,32 @@ def test_a_pinhole_behind_the_floor_sees_through_it(tracer: Build, spec: SensorS
     ]
     assert images[1].mean() > 0
     np.testing.assert_allclose(images[0], images[1], atol=1e-3 * images[1].max())
+
+
+@pytest.mark.parametrize("dotted", [False, True])
+def test_a_surface_that_is_shown_is_not_built_again(
+    dotted: bool, spec: SensorSpec, pressed: GelSurface, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor for further samples; another surface, or other ink, is."""
+    dots = replace(spec.markers, rows=2, columns=2) if dotted else replace(spec.markers, rows=0, columns=0)
+    tracer = RayTraced(integrator="reference", spp=1).build(replace(spec, markers=dots), resolution=TINY, device="cpu")
+    tracer.render_layers(GelSurface.at_rest(pressed.grid))
+    assert tracer.scene is not None
+    built: list[str] = []
+    params, update = tracer.scene.params, tracer.scene.params.update
+
+    def counted() -> None:
+        built.extend(sorted(key for _, keys in update() for key in keys if key.startswith("vertex")))
+
+    monkeypatch.setattr(params, "update", counted)
+    tracer.render_layers(GelSurface.at_rest(pressed.grid))
+    assert not built
+    for _ in range(2):
+        tracer.render_layers(pressed, spp=2)
+        assert built == ["vertex_positions"]
+    tracer.render_layers(GelSurface.at_rest(pressed.grid))
+    assert built == ["vertex_positions"] * 2
+    if dotted:
+        for _ in range(2):
+            tracer.scene.set_surface(pressed.grid.rest, np.full(pressed.grid.shape, 0.5, np.float32))
+        assert built == ["vertex_positions"] * 2 + ["vertex_albedo"]

@@ -9,10 +9,14 @@ import numpy as np
 import pytest
 
 from raytac.errors import InputError
+from raytac.gel.surface import make_grid
+from raytac.physics.objects import object_parts
+from raytac.physics.press import PressTargets
 from raytac.physics.rigid.load_law import LoadLaw
 from raytac.physics.rigid.pad import RigidPad
 from raytac.physics.soft.mesh import PadLevel, pad_mesh
 from raytac.physics.soft.pad import SoftPad
+from raytac.physics.soft.placement import PressPlacement
 from raytac.physics.soft.press_solver import PressSolver
 from raytac.specs.press import StageSpec
 from tests.physics.soft_presses import FRICTIONLESS, PITCH, RADIUS, SENSOR, indent, press, soft, uncorrected
@@ -178,6 +182,22 @@ def test_a_ball_that_rolls_leaves_the_gel_where_it_was():
     # Mindlin's 8 G a / (2 − ν) and a sheared layer's G A / h, a = 1.6 mm.
     assert force[0][1] == pytest.approx(1.5e3 * RADIUS * angle, rel=0.15)
     assert np.hypot(*force[1]) < 0.1 * np.hypot(*force[0])
+
+
+def test_a_case_that_moves_leaves_the_object_where_it_is():
+    """Whatever height, shear, tilt and twist: the case's pose times the object's in it is the object's at first touch."""
+    scene = press(indent(0.5e-3), kind="cylinder", position=(1e-3, -0.5e-3))
+    grid, targets = make_grid(SENSOR.gelpad, PITCH), PressTargets(scene, 2)
+    placement = PressPlacement(scene, object_parts(scene.object), SENSOR.gelpad, grid, targets)
+    motion = (
+        np.array([-0.5e-3, 0.2e-3]),
+        np.array([[0.3e-3, 0.0], [0.1e-3, -0.4e-3]]),
+        np.array([[0.1, -0.05, 0.4], [0.0, 0.2, -0.3]]),
+    )
+    fixed = placement.case(*motion) @ placement.poses(*motion)
+    np.testing.assert_allclose(fixed, placement.poses(np.zeros(2), np.zeros((2, 2)), np.zeros((2, 3))), atol=1e-12)
+    drop = placement.touch_drop(np.zeros((2, 2)), np.array([[0.0, 0.0, 0.4], [0.1, 0.0, 0.0]]))
+    assert abs(drop[0]) < 1e-9 and drop[1] < -0.1e-3  # a tilted face touches earlier, with its rim
 
 
 def test_a_tilt_goes_in_steps_of_the_path_that_it_drags_the_contact():

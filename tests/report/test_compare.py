@@ -133,6 +133,7 @@ def test_report_opens_offline_and_names_every_mode(quick: Path) -> None:
 def test_pictures_show_something(quick: Path) -> None:
     pareto, sheet = read_png(quick / "pareto.png"), read_png(quick / "sheet_sphere_80x60.png")
     assert pareto.shape[1] == sheet.shape[1] == round(7.16 * coarse_figures.MOST)
+    assert coarse_figures.asked["pareto.png"] == coarse_figures.asked["sheet_sphere_80x60.png"] == 300
     for picture in (pareto, sheet):
         assert 0.002 < (picture < 128).any(axis=-1).mean() < 0.9
     # Second column of the sheet is fast: its image in colour, and below it a signed error that is neither flat nor saturated.

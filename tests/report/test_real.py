@@ -63,6 +63,19 @@ def test_errors_are_those_of_the_regions() -> None:
     assert "| ray tracer | 6.00 |" in text and "| 7.00, 4.00 |" in text and "Noise floor: 2.00" in text
 
 
+def test_errors_of_the_ring_are_told_apart() -> None:
+    """Red lies 3 levels low, green alternates by 2 levels around 1 level high, blue is right."""
+    real = shots()
+    wave = np.where(np.indices((240, 320)).sum(0) % 2, -1.0, 3.0)
+    off = np.stack([np.full((240, 320), -3.0), wave, np.zeros((240, 320))], axis=-1)
+    score = press_scores(SENSOR, real.presses + off, real)[0]
+    by_channel = [score[f"ring_mae_{name}"] for name in ("red", "green", "blue")]
+    assert by_channel == pytest.approx([3.0, 2.0, 0.0], abs=0.02) and score["ring_mae"] == pytest.approx(5 / 3, abs=0.01)
+    skewed = np.where(np.arange(320) % 4 == 0, 9.0, 1.0)[:, None] * np.array([-1.0, 1.0, 0.0])
+    score = press_scores(SENSOR, real.presses + skewed, real)[0]
+    assert score["ring_even"] == pytest.approx(2 / 3), "the median leaves out what few pixels show"
+
+
 def test_errors_are_listed_by_press() -> None:
     """In the order of the presses, folds after each other; labelled circles are not among them."""
     scores = [{"contact_mae": float(k), "ring_mae": 2.0 * k, "frame_mae": 9.0} for k in range(3)]

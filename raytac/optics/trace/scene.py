@@ -79,18 +79,19 @@ class SensorScene:
         # Opaque, or their addresses become constants of the kernels, which then compile again for every scene.
         dr.make_opaque(self._coat, *self._leds)
         self._context = mi.BSDFContext()
-        self.set_surface(grid.rest)
 
     def _coat_mesh(self, faces: np.ndarray) -> Any:
         mi = self.mi
         props = mi.Properties()
         props["bsdf"] = mi.load_dict(coat_bsdf(self.sensor.coat, dotted=self._dotted))
         mesh = mi.Mesh("coat", len(self._xy), len(faces), has_vertex_normals=True, props=props)
+        self._shown = {"vertex_positions": self._vertices(self.grid.rest)}
+        """Present values of the coat's nodes."""
         if self._dotted:
-            mesh.add_attribute("vertex_albedo", 3, self._albedo(None))
+            self._shown["vertex_albedo"] = self._albedo(None)
+            mesh.add_attribute("vertex_albedo", 3, self._shown["vertex_albedo"])
         params = mi.traverse(mesh)
-        vertices = self._vertices(self.grid.rest)
-        params["vertex_positions"] = mi.Float(vertices)
+        params["vertex_positions"] = mi.Float(self._shown["vertex_positions"])
         params["faces"] = mi.UInt32(faces.ravel())
         params.update()
         return mesh
@@ -151,11 +152,19 @@ class SensorScene:
         return np.stack(inked_albedo(self.sensor, share), axis=-1).astype(np.float32).ravel()
 
     def set_surface(self, height: np.ndarray, ink: np.ndarray | None = None) -> None:
-        """Move the coat's nodes to ``height`` (Ny, Nx) [m], with the share ``ink`` of dots."""
-        self.params["coat.vertex_positions"] = self.mi.Float(self._vertices(height))
+        """Move the coat's nodes to ``height`` (Ny, Nx) [m], with the share ``ink`` of dots.
+
+        Where they are there already, the hierarchy of the scene is not built again.
+        """
+        moved = {"vertex_positions": self._vertices(height)}
         if self._dotted:
-            self.params["coat.vertex_albedo"] = self.mi.Float(self._albedo(ink))
-        self.params.update()
+            moved["vertex_albedo"] = self._albedo(ink)
+        moved = {name: values for name, values in moved.items() if not np.array_equal(values, self._shown[name])}
+        for name, values in moved.items():
+            self.params[f"coat.{name}"] = self.mi.Float(values)
+        if moved:
+            self.params.update()
+            self._shown |= moved
 
     def height_at(self, x: Any, y: Any) -> Any:
         """z of the coat mesh at device points x, y, in scene units, by a ray along +z."""

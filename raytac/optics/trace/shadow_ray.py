@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from raytac.optics.geometry import CoatField, CoatLayout
+from raytac.optics.geometry import CoatField, CoatLayout, clipped
 
 TILE = 0.25e-3
 """Edge of a tile [m], about: a ray looks at or skips a stretch of that length."""
@@ -149,19 +149,22 @@ class Depths:
 
         def look(s: Any, least: Any) -> tuple[Any]:
             for k in range(cells):
-                at = dr.minimum(s + k * step, reach)
+                at = s + k * step
+                at = dr.select(at < reach, at, reach)
                 clearance = field.z_in(g.cell_at(mi, env, x + at * vx, y + at * vy)) - (p.z - at * rise)
-                least = dr.minimum(least, clearance * dr.rcp(at))
+                angle = clearance * dr.rcp(at)
+                least = dr.select(angle < least, angle, least)
             return (least,)
 
-        def near(s: Any) -> Any:
-            tx = mi.UInt32(dr.clip(first_x + s * (vx * (1 / cells)), 0, columns - 1))
-            ty = mi.UInt32(dr.clip(first_y + s * (vy * (1 / cells)), 0, rows - 1))
+        def near(s: Any, least: Any) -> Any:
+            tx = mi.UInt32(clipped(first_x + s * (vx * (1 / cells)), columns - 1))
+            ty = mi.UInt32(clipped(first_y + s * (vy * (1 / cells)), rows - 1))
             bound = dr.gather(mi.Float, self.windows, own + (ty * columns + tx))
-            return above_p + dr.minimum(gain * s, gain * (s + edge)) <= bound
+            steeper = gain + (tan_half - least)  # only what is steeper than the least so far counts
+            return above_p + steeper * dr.select(steeper > 0, s, s + edge) <= bound
 
         def walk(s: Any, least: Any) -> tuple[Any, Any]:
-            (least,) = dr.if_stmt((s, least), near(s), look, lambda s, least: (least,), label="stretch", mode="symbolic")
+            (least,) = dr.if_stmt((s, least), near(s, least), look, lambda s, least: (least,), label="stretch", mode="symbolic")
             return s + edge, least
 
         # Nothing in the way means a clearance of tan_half or more; a start of 1 would shade what lies right under an LED.

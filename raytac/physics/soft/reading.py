@@ -228,7 +228,7 @@ class _Batch:
         self._unread.write()
 
     def copies(self, state: CoatState) -> list[np.ndarray]:
-        """What ``read`` has shown of a state, and its objects' poses and which of them touch, in NumPy."""
+        """Numbers that ``read`` has shown of a state, and poses and touch of its objects."""
         if self._host is None or self._host[0] is not state:
             shown = self._shown.result
             numbers = shown.failed, shown.clearance, shown.residual, shown.centre, shown.coat, shown.vertices, shown.forces
@@ -347,7 +347,7 @@ class _Repeated:
         self._state: CoatState | None = None
         self._recorded: Recorded | None = None
         self.result: Any = None
-        """What the last launch returned."""
+        """Arrays of the last launch."""
 
     def __call__(self, state: CoatState) -> Any:
         if self._state is not state:

@@ -10,13 +10,14 @@ import pytest
 import warp as wp
 
 import ipc
+from ipc.blocks import THREADS
 from ipc.bodies import Layout, build_layout, rotation_matrix
 from ipc.contact.contacts import Contacts, mat34d
 from ipc.solver.block_jacobi import BlockJacobi
 from ipc.solver.frames import VertexMap
 from ipc.solver.linear import SystemView, turn_rows
 from ipc.solver.preconditioners import pays
-from ipc.solver.preconditioners.rest_inverse import RestInverse
+from ipc.solver.preconditioners.rest_inverse import RestInverse, place_running
 from ipc.solver.preconditioners.rest_stiffness import rest_blocks
 from ipc.solver.preconditioners.substructure import choose_partition, entries, partition
 from tests.ipc.conftest import bonded_pad, small_pad
@@ -384,3 +385,17 @@ def test_auto_takes_the_rest_inverse_where_it_pays(
     layout = build_layout(bodies, 0.0, {}, [])
     device = cast(Any, SimpleNamespace(is_cuda=cuda))
     assert pays(layout, ipc.Settings(linear_tolerance=tolerance), batch, device) == expected
+
+
+@pytest.mark.parametrize(
+    "device",
+    ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, pytest.mark.skipif(not wp.is_cuda_available(), reason="needs CUDA")])],
+)
+@pytest.mark.parametrize("batch", [1, 256, 257, 1000])
+def test_running_environments_are_numbered_in_their_order(device: str, batch: int, rng: np.random.Generator) -> None:
+    flags, threads = rng.integers(0, 2, batch), THREADS if device == "cuda" else 1
+    running = wp.array(flags, dtype=wp.int32, device=device)
+    place, total = (wp.zeros(n, dtype=wp.int32, device=device) for n in (batch, 1))
+    wp.launch(place_running, threads, [running, threads], [place, total], device=device, block_dim=threads)
+    np.testing.assert_array_equal(place.numpy(), np.where(flags, np.cumsum(flags) - flags, -1))
+    assert total.numpy()[0] == flags.sum()

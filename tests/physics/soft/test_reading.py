@@ -125,6 +125,22 @@ def test_kernels_read_what_numpy_reads(name, device):
 
 
 @pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("name", CORRECTIONS)
+def test_a_height_that_is_not_finite_fails_alone(name, device):
+    """Vertices are finite, and their height is not in single precision."""
+    vertices, forces, objects = in_numpy(pressed())
+    vertices = vertices.copy()
+    vertices[0, vertices.shape[1] // 2, 2] = -1e60
+    given, sound = CoatState.of(vertices, forces, objects, device=device), np.zeros(3, bool)
+    mine = reader(CORRECTIONS[name])
+    for _ in range(2):  # launched one by one, then as one recording
+        seen = mine.read(given, sound)
+        assert seen.failed.tolist() == [True, False, False]
+        assert np.isnan(seen.surface.height[0]).all() and np.isfinite(seen.surface.height[1:]).all()
+        assert not seen.surface.contact[0].any() and seen.surface.contact[1:].any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_a_recording_reads_what_its_arrays_hold_now(device):
     vertices, forces, objects = in_numpy(pressed())
     objects, sound = [replace(objects[0], touching=None)], np.zeros(3, bool)

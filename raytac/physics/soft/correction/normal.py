@@ -172,7 +172,9 @@ class NormalCorrection:
         self._launch(kernels.choose_windows, each[0], [sound, clearance, self._near, s])
         self._launch(kernels.first_pressures, lines, [s, self.hats, self._wide, self.load, self._start.numbers])
         self._launch(kernels.greatest_in_window, each[0], [s, self._start.numbers, self._greatest])
-        begun = [self._p.numbers, self._t.numbers, self.pressure.numbers, self._overlapping]
+        for one in (self._p, self._t, self.pressure):
+            one.padded.zero_()
+        begun = [self._p.numbers, self.pressure.numbers, self._overlapping]
         self._launch(kernels.begin, lines, [s, self._overlap.numbers, self._greatest, self._start.numbers, *begun])
         self._launch(kernels.put, 1, [1, self._go])
         with wp.ScopedDevice(self.products.device):

@@ -208,30 +208,25 @@ def begin(
     s: Search, overlap: wp.array3d(dtype=wp.float32), greatest: wp.array(dtype=wp.float32), start: wp.array3d(dtype=wp.float32),
     # outputs
     p: wp.array3d(dtype=wp.float32),
-    t: wp.array3d(dtype=wp.float32),
     best: wp.array3d(dtype=wp.float32),
     overlapping: wp.array2d(dtype=wp.int32),
 ):  # fmt: skip
-    """Pressure to begin with where the coat overlaps the object, by (environment, row)."""
+    """Pressure to begin with where the coat overlaps the object, else 0 as before.
+
+    By (environment, row).
+    """
     env, row = wp.tid()
     columns, rows = s.columns[env], s.rows[env]
-    is_in = row >= rows[0] and row < rows[1]
-    pressure, kept, direction, overlapped = p[env, row], best[env, row], t[env, row], overlap[env, row]
-    i, end = wp.int32(0), p.shape[2]
-    while i < end:
-        pressure[i] = _ZERO
-        kept[i] = _ZERO
-        direction[i] = _ZERO
-        i += 1
-    if is_in:
-        i, end = wp.max(columns[0], 0), columns[1]
-        while i < end:
-            if overlapped[i] > _ZERO:
-                value = wp.max(start[env, row, i], greatest[env] * wp.float32(1e-3))
-                pressure[i] = value
-                kept[i] = value
-            i += 1
     overlapping[env, row] = 1
+    if row < rows[0] or row >= rows[1]:
+        return
+    i, end = wp.max(columns[0], 0), columns[1]
+    while i < end:
+        if overlap[env, row, i] > _ZERO:
+            value = wp.max(start[env, row, i], greatest[env] * wp.float32(1e-3))
+            p[env, row, i] = value
+            best[env, row, i] = value
+        i += 1
 
 
 @wp.kernel
