@@ -132,7 +132,7 @@ def _sum_layout(layout: Layout, bodies: tuple[Body, ...], device: wp.Device) -> 
     result: Any = filled(SumLayout, device, {name: getattr(layout, name) for name in names})
     result.framed = wp.array(layout.framed[: len(bodies)].astype(np.int32), dtype=wp.int32, device=device)
     result.affine = wp.array(affine, dtype=wp.int32, device=device)
-    result.first_body = wp.array(layout.pairs[:, 0], dtype=wp.int32, device=device)
+    result.first_body = wp.array(np.ascontiguousarray(layout.pairs[:, 0]), dtype=wp.int32, device=device)
     result.share = wp.array(_shares(layout), dtype=wp.float64, device=device)
     result.corner = wp.array(np.reshape(corner, (-1, 3)), dtype=wp.vec3d, device=device)
     result.gradient = wp.array(np.reshape(gradient, (-1, 4, 3)), dtype=wp.vec3d, device=device)

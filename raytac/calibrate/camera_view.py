@@ -64,12 +64,13 @@ def with_view(sensor: SensorSpec, view: np.ndarray) -> SensorSpec:
     The sensor itself where that is its view, so that a camera which was not fitted keeps its numbers to the last digit.
     """
     camera = camera_with_view(sensor.camera, *map(float, view))
-    return sensor if camera is sensor.camera else dataclasses.replace(sensor, camera=camera)
+    # Not ``is``: the cache may answer with an equal camera of another sensor.
+    return sensor if camera == sensor.camera else dataclasses.replace(sensor, camera=camera)
 
 
 @lru_cache(1024)
 def camera_with_view(camera: CameraSpec, distance: float, distortion: float) -> CameraSpec:
-    """The camera of ``with_view``; that which is given if it has this view."""
+    """The camera of ``with_view``; one equal to that which is given if it has this view."""
     own = _view(camera)
     if (distance, distortion) == own:
         return camera

@@ -54,8 +54,13 @@ class Photographs:
 
 
 def shrunk(images: np.ndarray, factor: int) -> np.ndarray:
-    """Mean of every ``factor`` × ``factor`` pixels of images (..., H, W, 3)."""
+    """Mean of every ``factor`` × ``factor`` pixels of images (..., H, W, 3).
+
+    Raises InputError for a size that is no multiple of ``factor``.
+    """
     *batch, height, width, _ = images.shape
+    if height % factor or width % factor:
+        raise InputError("size of the images", value=(width, height), rule=f"must be a multiple of {factor} on both sides")
     rows = images.reshape(*batch, height // factor, factor, width, 3).sum(-3)
     # Ten times faster than a mean over both axes, which goes through memory pixel by pixel.
     total = rows[..., ::factor, :]

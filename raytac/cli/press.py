@@ -49,7 +49,7 @@ class PressArgs(ShadowOptions, SolverOptions):
     yaw: float = 0.0
     """Turn of the object about the pad's normal [degrees], clockwise in the image."""
     tilt: float = 0.0
-    """Turn about the image's horizontal axis before that [degrees]: the upper side goes deeper."""
+    """Lean at the start, before that turn [degrees]; the upper side in the image goes deeper."""
     scale: float | None = None
     """Metres per unit of a mesh file; if not given 0.001 (millimetres), of GLB 1."""
     repair: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False

@@ -30,7 +30,7 @@ class PadReading:
         has_forces: False if this is a bare surface, of which nothing else is known.
         pad_from_object: pose of the pressed object, (B, 4, 4). This and the next two are NaN in a world.
         world_from_pad: pose of the case, (B, 4, 4); the identity unless the scene moves it (world and pad frame are one at first touch).
-        depth: travel below first touch at zero shear and twist [m], (B,); negative when lifted.
+        depth: travel below first touch at zero shear, twist and tilt [m], (B,); negative when lifted.
         force_law_area: area of contact by the law that ties force to depth [m²], (B,); None without such a law.
         solved: what the physics itself knows beyond this, of a type of its own: ``SoftReading`` of a soft pad's press; else None.
         shear: elastic shear of the contact with the body that is deepest; None where the physics has no such state.

@@ -309,7 +309,7 @@ class PressPad(ABC):
         Raises:
             InputError: ``steps_per_stage`` below 1. An environment whose own target takes the object off the pad, or past the gel's bonded
                 face; the error names target and environment.
-            SpecError: the same by the scene's own depth, force, place, shear or twist; the error names the scene's file and key.
+            SpecError: the same by the scene's own depth, force, place, shear, twist or tilt; the error names the scene's file and key.
         """
         check_whole("steps_per_stage", steps_per_stage, 1, MOST_STEPS)
         self._start()

@@ -83,7 +83,7 @@ def press_of(
         force: normal force that it is pressed with [N], likewise. A mesh or a height map needs one of the two.
         offset: displacement of the object along x and y, pad frame [m].
         yaw: turn about the pad frame's z and the object's origin [rad], clockwise in the image.
-        tilt: turn about the pad frame's x before that [rad]; the object leans towards the side that is up in the image.
+        tilt: turn about the pad frame's x before that [rad], at the start; the object leans towards the side that is up in the image.
         scale: metres per unit of a mesh; None is 0.001, a file in millimetres, but 1 for GLB, which is in metres, and for a mesh in memory.
         pitch: spacing of the rows and columns of a height map [m].
         repair: close the holes of a mesh, as ``load_mesh`` does.

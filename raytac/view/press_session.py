@@ -1,4 +1,7 @@
-"""A press scene as a session: its trajectory, and sliders to press, shear and twist."""
+"""A press scene as a session: its trajectory, and sliders to press, shear and twist.
+
+No slider tilts; a tilt that the scene has made stays while the sliders drive.
+"""
 
 from __future__ import annotations
 
@@ -134,7 +137,7 @@ class PressSession:
         deepest = max([_DEEPEST * thickness, *(1e3 * (stage.depth or 0.0) for stage in scene.trajectory)])
         return (
             Control("depth", "depth [mm]", 0.0, round(deepest, 2), 0.01, "Below first touch; 0 lifts the object off", "force"),
-            Control("force", "force [N]", 0.0, _STRONGEST, 0.05, "Normal force, kept through shear and twist", "depth"),
+            Control("force", "force [N]", 0.0, _STRONGEST, 0.05, "Normal force, kept through shear, twist and tilt", "depth"),
             Control("shear_x", "shear x [mm]", -_FARTHEST, _FARTHEST, 0.02),
             Control("shear_y", "shear y [mm]", -_FARTHEST, _FARTHEST, 0.02),
             Control("twist", "twist [°]", -_WIDEST, _WIDEST, 0.5),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from raytac.calibrate.camera_view import ViewBounds, tells_view, view_of
+from raytac.calibrate.camera_view import ViewBounds, tells_view, view_of, with_view
 from raytac.calibrate.direct_fit import DirectFit, FitSettings, FitState
 from raytac.calibrate.imprint import RIGID_PAD
 from raytac.calibrate.light_parameters import LightParameters, with_parameters
@@ -41,6 +41,13 @@ def problem_of(sensor: SensorSpec, fixed: tuple[str, ...] = ()) -> tuple[DirectF
     shots = Photographs(grey, grey[None], np.array([[width / 2, height / 2, 30.0]]), np.full(1, 3e-3))
     state = FitState(LightParameters.of(sensor, grey), RIGID_PAD.copy(), shots.circles.copy())
     return DirectFit(sensor, shots, state, FitSettings(fixed=("mix", "tone", *fixed), samples=(20, 20)), factor=4), state
+
+
+def test_a_sensor_with_its_own_view_is_itself_though_another_is_equal() -> None:
+    first, second = load_sensor("gelsight_mini"), load_sensor("gelsight_mini")
+    assert first.camera is not second.camera
+    for sensor in (first, second, first):
+        assert with_view(sensor, view_of(sensor)) is sensor
 
 
 @pytest.mark.parametrize("fixed", [(), ("distance",), ("distortion",)])

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from raytac.calibrate.photographs import read_photographs
+from raytac.calibrate.photographs import read_photographs, shrunk
 from raytac.errors import InputError
 from raytac.io.images import write_png
 from raytac.specs import SensorSpec, load_sensor
@@ -48,3 +48,11 @@ def test_photographs_are_read_or_refused(sensor: SensorSpec, tmp_path: Path) -> 
     (tmp_path / "labels.csv").write_text(head + row, "utf-8")
     with pytest.raises(InputError, match="sensor's size"):
         read_photographs(tmp_path, sensor)
+
+
+def test_images_are_shrunk_by_whole_blocks_alone() -> None:
+    images = np.random.default_rng(0).uniform(size=(2, 4, 6, 3))
+    np.testing.assert_allclose(shrunk(images, 2), images.reshape(2, 2, 2, 3, 2, 3).mean(axis=(2, 4)), rtol=1e-12)
+    for shape in ((4, 5, 3), (5, 4, 3), (2, 8, 6, 3)):
+        with pytest.raises(InputError, match="must be a multiple of 4"):
+            shrunk(np.ones(shape), 4)

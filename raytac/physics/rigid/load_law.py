@@ -256,9 +256,9 @@ def first_touch(parts: Sequence[Part], pose: np.ndarray, gelpad: GelpadSpec, gri
 
 
 def too_deep(depth: float, deepest: float) -> InputError:
-    """Error for a ``depth`` [m] where the bonded face is at ``deepest`` [m].
+    """Error for a ``depth`` past the bonded face, which is at ``deepest`` [m].
 
-    Both count from the first touch at the start.
+    Both are below the first touch at the start.
     """
     rule = f"would press deeper than the pad is there: at most {deepest * 1e3:.5g} mm"
     if deepest <= 0.0:
@@ -274,7 +274,7 @@ def gap_at_touch(parts: Sequence[Part], pose: np.ndarray, grid: PadGrid) -> np.n
 def _least(of: Callable[[np.ndarray, np.ndarray], np.ndarray], values: np.ndarray, grid: PadGrid) -> tuple[float, float, float]:
     """Least value of a function over the pad, and its x, y [m].
 
-    It is found by zooming in on the lowest of its node ``values``.
+    Zooms in on the lowest of its node ``values``.
     """
     x, y, least = grid.x, grid.y, (np.inf, 0.0, 0.0)
     for zoom in range(_ZOOMS + 1):

@@ -175,7 +175,8 @@ def object_body(
     surface = _checked_surface(OBJECT, parts, sag)
     if spec.dynamics == "kinematic":
         if lowest > 0.0:
-            # A tilt by α lowers one point against another by at most sin α times their distance.
+            # A point that is left out lies higher than the lowest one, d away, by more than 2 r sin α >= d sin α: at a slope e > α.
+            # A tilt by α takes at most d (sin e − sin(e − α)) of that, which grows to d sin α as e falls to α.
             lowest += 2.0 * math.sin(tilt) * float(np.linalg.norm(surface.vertices, axis=1).max())
             heights = (surface.vertices @ row for row in rotations[:, 2])
             near = np.any([height[surface.faces].min(axis=1) - height.min() <= lowest for height in heights], axis=0)

@@ -40,7 +40,7 @@ class PressPlacement:
         self.origin = np.zeros((len(centres), 3))
         """Object's origin at first touch, zero shear and turn, shape (B, 3) [m]."""
         self.lever = np.zeros(len(centres))
-        """Height of the origin over the gel that is touched, (B,) [m]: a tilt's lever."""
+        """Height of the origin over the gel that is touched there, (B,) [m]."""
         for b, (x, y) in enumerate(centres.tolist()):
             try:
                 touch, _, self.lever[b] = self._touch(b, x, y, np.zeros(3))
@@ -112,10 +112,7 @@ class PressPlacement:
             state = self.end_of(index, stage, *state)
 
     def _touch(self, b: int, x: float, y: float, turn: np.ndarray) -> tuple[float, float, float]:
-        """Height, travel to the bonded face and lever of ``FirstTouch`` [m].
-
-        Cached, as environments share poses.
-        """
+        """Height, travel to the bonded face and lever of ``FirstTouch`` [m]; cached."""
         pose = np.eye(4)
         pose[:3, :3] = turn_rotations(turn) @ self._rotations[b]
         pose[:2, 3] = x, y
