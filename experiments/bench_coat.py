@@ -48,6 +48,8 @@ LOADS = {
 RANGES = {"near": (0.02e-3, 1e-3), "beyond": (1e-3, 2e-3), "far": (2e-3, 4e-3)}
 _DEEPER = 0.1e-3
 """Room for a truth to be pressed deeper than the scene says [m]."""
+_BLOCKS = (2, 2, 1), 1.0
+"""Volume blocks of a truth, without which it would lock, and the elements' own share, as of the medium level."""
 _GROWTH, _DOWN = 0.14, 0.25
 """How much a cell grows for each unit of distance from the sharp line, across and downwards."""
 
@@ -131,7 +133,7 @@ def marked(spec: SensorSpec, levels: tuple[str, ...], cell: float) -> dict[str, 
     """Markers under a ball that is pressed, sheared or twisted, off those of a pad with cells of ``cell`` [m] in the middle."""
     target = ObjectSpec("sphere", {"radius": 4e-3}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.05)
     probes = np.stack(np.meshgrid(np.arange(-9, 10) * 1e-3, np.arange(-7, 8) * 1e-3), axis=-1).reshape(-1, 2)
-    truth_mesh = pad_mesh(spec.gelpad, PadLevel(2.9 * cell, max(round(2.2e-3 / cell), 3), 7.0, 5.0, cell / 25.0))
+    truth_mesh = pad_mesh(spec.gelpad, PadLevel(2.9 * cell, max(round(2.2e-3 / cell), 3), 7.0, 5.0, cell / 25.0, *_BLOCKS))
     metrics: dict[str, Metric] = {}
     for load, stages in LOADS.items():
         truth = np.zeros(0)
@@ -197,7 +199,9 @@ def refined(spec: SensorSpec, sharp: float, cell: float) -> PadMesh:
     turned = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) < (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     top[turned] = top[turned][:, ::-1]
     coat = CoatMesh(vertices[on_coat], (top - on_coat[0]).astype(np.int32), x, y)
-    return PadMesh(ipc.TetMesh(vertices, tets.tets), coat, on_coat, np.arange(per_layer), cell / 8.0)
+    block, own = _BLOCKS
+    blocks = ipc.grid_blocks((len(x) - 1, len(y) - 1, len(z) - 1), block)
+    return PadMesh(ipc.TetMesh(vertices, tets.tets), coat, on_coat, np.arange(per_layer), cell / 8.0, blocks, own)
 
 
 def steps(first: float, length: float, growth: float) -> np.ndarray:

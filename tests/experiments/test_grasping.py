@@ -141,10 +141,13 @@ def test_endurance_goes_on_where_it_stopped(tmp_path):
         endurance.main(endurance.Args(out=tmp_path / "parts", steps=steps, **small))
     one, two = (read_metrics(tmp_path / name / "metrics.json") for name in ("whole", "parts"))
     assert one["endurance.steps"] == two["endurance.steps"] == 72 and one["endurance.bond_m"] == 0.0
-    assert float(one["endurance.frame_m"]) < 1e-12 and float(one["endurance.drift_mm"]) < 1e-3
-    assert one["endurance.unconverged_steps"] == 0 and float(one["endurance.min_det_f"]) > 0.9
+    assert (
+        float(one["endurance.frame_m"]) < 1e-12 and float(one["endurance.drift_mm"]) < 2e-3
+    )  # some elastic slips of its contacts
+    # Volume blocks keep the volume of their elements together; a single one is squeezed by half.
+    assert one["endurance.unconverged_steps"] == 0 and float(one["endurance.min_det_f"]) > 0.4
     assert 0.3 < float(one["endurance.lifted_least_mm"]) < 0.5 and 0.0 < float(one["endurance.bond_share"]) < 1e-3
     for key in ("min_gap_m", "min_det_f", "drift_mm"):
-        assert one[f"endurance.{key}"] == pytest.approx(two[f"endurance.{key}"], rel=1e-6, abs=1e-9)
+        assert one[f"endurance.{key}"] == pytest.approx(two[f"endurance.{key}"], rel=1e-6, abs=1e-8)
     with pytest.raises(RaytacError, match="other settings"):
         endurance.main(endurance.Args(out=tmp_path / "parts", steps=108, force=2.0, **small))

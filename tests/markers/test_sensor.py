@@ -131,7 +131,7 @@ def test_calibrate_quickly_and_go_on_after_an_interrupt(
 
     monkeypatch.setattr(report, "simulate_press", interrupted)
     assert main(args) == 130
-    assert "finished presses are kept" in capsys.readouterr().err
+    assert "presses that are finished are kept" in capsys.readouterr().err
     assert [path.name for path in out.iterdir()] == ["presses"] and len(list((out / "presses").iterdir())) == 2
     assert [path.name for path in tmp_path.iterdir()] == ["fit"]
     assert main(args) == 0

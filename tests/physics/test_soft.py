@@ -119,18 +119,19 @@ def test_the_coats_vertices_lie_on_the_surface_that_is_shown(pressed):
 
 
 @pytest.mark.parametrize(
-    ("level", "steps", "count"),
+    ("level", "steps", "count", "most"),
     [
-        ("coarse", 1, 9),
-        pytest.param("coarse", 16, 9, marks=pytest.mark.slow),
-        pytest.param("medium", 1, 17, marks=pytest.mark.slow),
+        ("coarse", 1, 9, 6e-6),
+        pytest.param("coarse", 16, 9, 6e-6, marks=pytest.mark.slow),
+        pytest.param("medium", 1, 17, 16e-6, marks=pytest.mark.slow),
     ],
 )
-def test_a_light_ball_does_not_push_the_skin_out_from_under_itself(level, steps, count):
-    """What touches sticks, however large the steps: neither vertices nor markers spread.
+def test_a_light_ball_does_not_push_the_skin_out_from_under_itself(level, steps, count, most):
+    """What touches sticks, however large the steps: markers do not spread, and vertices by ``most`` [m].
 
-    On a pad with cells of 0.25 mm they spread by 1 to 3 µm. The area of contact is that of such a pad, 4.39 mm²
-    (``experiments/bench_coat.py --shapes ball``), within 3 %.
+    On a pad with cells of 0.25 mm they spread by 1 to 3 µm. Inside the volume blocks of the medium level vertices move to and fro by more,
+    which the skin does not follow. The area of contact is that of such a pad, 4.39 mm² (``experiments/bench_coat.py --shapes ball``),
+    within 3 %.
     """
     pad = SoftPad(SENSOR, press(indent(0.3e-3)), pitch=0.1e-3, level=level)
     reading = pad.peak(pad.run(steps)).solved
@@ -139,7 +140,7 @@ def test_a_light_ball_does_not_push_the_skin_out_from_under_itself(level, steps,
     rest = reading.surface.coat.mesh.rest
     under = np.hypot(*rest[:, :2].T) < 1.2e-3
     mesh, skin = (np.linalg.norm((at - rest)[0, under, :2], axis=1) for at in (reading.vertices, reading.surface.coat.positions))
-    assert under.sum() == count and mesh.max() < 6e-6 and skin.max() < 1e-6
+    assert under.sum() == count and mesh.max() < most and skin.max() < 1e-6
 
 
 def test_a_contact_that_is_not_solved_is_warned_of_once():
