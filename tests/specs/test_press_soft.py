@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 
 from raytac.errors import SpecError
-from raytac.physics.rigid.pad import RigidPad
 from raytac.specs import load_press, load_sensor
 from raytac.specs.press import ObjectSpec, PressScene, StageSpec
 
@@ -55,12 +54,15 @@ def test_a_weight_needs_a_force(tmp_path):
     assert load_press(write(tmp_path, object='dynamics = "affine"', indent="force_n = 0.5")).object.dynamics == "affine"
 
 
+@pytest.mark.solver
 @pytest.mark.parametrize(
     "stage",
     [StageSpec("tilt", tilt=(0.2, 0.0)), StageSpec("twist", twist=0.1), StageSpec("shear"), StageSpec("indent", depth=1e-4)],
 )
 def test_a_free_body_made_in_python_is_only_laid_down_either(stage):
     """It would lie still through the stage; a further stage is refused by the same rule."""
+    from raytac.physics import RigidPad
+
     ball = ObjectSpec("sphere", {"radius": 4e-3}, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.05, "affine")
     laid = PressScene("laid", ball, (StageSpec("indent", force=0.5), StageSpec("release")))
     rule = rf"object\.dynamics = 'affine'.*force_n.*trajectory\[{{}}\] has it \({stage.kind}\)"
