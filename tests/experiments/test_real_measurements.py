@@ -19,7 +19,7 @@ from raytac.markers import camera_of
 from raytac.markers.registry import markers_config
 from raytac.physics import Rigid
 from raytac.se3 import rotations
-from raytac.specs import load_sensor
+from raytac.specs import SensorSpec, load_sensor
 
 SIZE, PITCH = (320, 240), 0.0532
 CIRCLE, BALL = np.array([150.0, 118.0, 36.0]), 3e-3
@@ -74,30 +74,34 @@ def test_ratios_that_no_gel_has_are_refused(tmp_path: Path) -> None:
         real_force.main(real_force.Args(data=data, radius_mm=5.0, levels="", poisson_ratios="0.6", device="cpu"))
 
 
+def rings(sensor: SensorSpec, at: np.ndarray, turned: np.ndarray) -> np.ndarray:
+    """Rings of a ball with layers that lie askew, where the ray of each pixel from the pinhole meets the ball at ``at``."""
+    height, pitch = -sensor.camera.position[2], PITCH / 1e3
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
+    ray = np.stack([(u - SIZE[0] / 2) * pitch / height, (v - SIZE[1] / 2) * pitch / height, np.ones_like(u)], axis=-1)
+    start = np.array([0.0, 0.0, -height]) - at
+    a, b, c = (ray**2).sum(axis=-1), ray @ start, start @ start - BALL**2
+    root = b**2 - a * c
+    own = (start + ((-b - np.sqrt(np.maximum(root, 0.0))) / a)[..., None] * ray) @ turned  # axes of the ball
+    layers = 6.0 * np.cos(2.0 * np.pi * (own @ np.array([0.25, -0.1, 0.963])) / 0.13e-3)
+    return np.where((root > 0.0) & (np.hypot(own[..., 0], own[..., 1]) < 0.75 * BALL), layers, 0.0)
+
+
+def ringed(dots: tuple[np.ndarray, np.ndarray], fields: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, ...]:
+    """Two photographs of dots with rings and grain."""
+    grain = np.random.default_rng(3).normal(size=(2, *SIZE[::-1]))
+    return tuple(
+        np.clip(photograph(at) + (field + noise)[..., None], 0, 255).astype(np.uint8)
+        for at, field, noise in zip(dots, fields, grain, strict=True)
+    )
+
+
 def test_a_rolling_balls_motion_is_read_from_its_layers(dots: np.ndarray) -> None:
     """Rings of a ball whose layers lie askew, which moves and tilts under a pinhole, under dots that do not go along."""
     sensor = real_markers.photographed(load_sensor("gelsight_mini"), SIZE, PITCH / 1e3)
-    height, pitch = -sensor.camera.position[2], PITCH / 1e3
     centre, shear, tilt = np.array([-0.5e-3, 0.2e-3, 1.6e-3]), np.array([0.1e-3, 0.45e-3]), np.array([0.03, 0.06])
-    v, u = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
-
-    def photographed(at: np.ndarray, turned: np.ndarray) -> np.ndarray:
-        """Rings where the ray of each pixel from the pinhole meets the ball at ``at``."""
-        ray = np.stack([(u - SIZE[0] / 2) * pitch / height, (v - SIZE[1] / 2) * pitch / height, np.ones_like(u)], axis=-1)
-        start = np.array([0.0, 0.0, -height]) - at
-        a, b, c = (ray**2).sum(axis=-1), ray @ start, start @ start - BALL**2
-        root = b**2 - a * c
-        own = (start + ((-b - np.sqrt(np.maximum(root, 0.0))) / a)[..., None] * ray) @ turned  # axes of the ball
-        layers = 6.0 * np.cos(2.0 * np.pi * (own @ np.array([0.25, -0.1, 0.963])) / 0.13e-3)
-        return np.where((root > 0.0) & (np.hypot(own[..., 0], own[..., 1]) < 0.75 * BALL), layers, 0.0)
-
     moved = centre + np.array([*shear, 0.0])
-    fields = photographed(centre, np.eye(3)), photographed(moved, rotations(np.array([*tilt, 0.0])))
-    grain = np.random.default_rng(3).normal(size=(2, *SIZE[::-1]))
-    images = tuple(
-        np.clip(photograph(dots) + (field + noise)[..., None], 0, 255).astype(np.uint8)
-        for field, noise in zip(fields, grain, strict=True)
-    )
+    images = ringed((dots, dots), (rings(sensor, centre, np.eye(3)), rings(sensor, moved, rotations(np.array([*tilt, 0.0])))))
     circle = np.array([*camera_of(sensor).project(centre - [0.0, 0.0, BALL]), 38.0])
     read = layer_motion(images, sensor, circle, centre, BALL)
     np.testing.assert_allclose(read.motion.lowest(BALL), shear + BALL * np.array([-tilt[1], tilt[0]]), atol=0.012e-3)
@@ -243,6 +247,34 @@ def test_a_model_recovers_its_own_drag_with_its_constant(tmp_path: Path, dots: n
     assert fots["constant.rms_um"] < 8.0 < 50.0 < fots["rms_um"]
     np.testing.assert_allclose((fots["constant.x_um"], fots["constant.y_um"]), 1e3 * PITCH * CONSTANT, atol=6.0)
     assert float(metrics["markers.force_field.constant.rms_um"]) > 4.0 * fots["constant.rms_um"]
+
+
+def test_models_are_told_the_motion_that_rings_show(tmp_path: Path, dots: np.ndarray) -> None:
+    """A ball that moves on and leans, under dots that hardly go along: models follow the ball, and leave its drag in the dots."""
+    sensor = real_markers.photographed(load_sensor("gelsight_mini"), SIZE, PITCH / 1e3)
+    ball = real_markers.pressed_ball(sensor, CIRCLE, BALL, "cpu")
+    assert ball.surface is not None
+    x, y = ball.surface.contact_centre[0]
+    centre, shear, tilt = np.array([x, y, BALL - ball.depth]), np.array([0.05e-3, 0.4e-3]), np.array([0.0, 0.05])
+    after = dots + np.array([0.3, 0.6])
+    turned, moved = rotations(np.array([*tilt, 0.0])), centre + np.array([*shear, 0.0])
+    data = drag_folder(tmp_path, dots, after)
+    fields = rings(sensor, centre, np.eye(3)), rings(sensor, moved, turned)
+    for k, image in enumerate(ringed((dots, after), fields)):
+        write_png(data / f"{k}.png", image)
+    args: dict[str, Any] = {
+        "circle_px": ",".join(map(str, CIRCLE)),
+        "ball_radius_mm": 1e3 * BALL,
+        "pitch_mm": PITCH,
+        "device": "cpu",
+        "models": "fots",
+    }
+    for name, layers in (("dots", False), ("rings", True)):
+        real_markers.main(real_markers.Args(data=data, layers=layers, out=tmp_path / name, **args))
+    by_dots, by_rings = (read_metrics(tmp_path / name / "metrics.json") for name in ("dots", "rings"))
+    assert float(by_rings["markers.layers.centre_y_um"]) == pytest.approx(400.0, abs=40.0)
+    assert float(by_rings["markers.layers.tilt_y_deg"]) == pytest.approx(np.degrees(0.05), abs=0.7)
+    assert float(by_rings["markers.fots.rms_um"]) > 2.0 * float(by_dots["markers.fots.rms_um"])
 
 
 @dataclass(frozen=True)
