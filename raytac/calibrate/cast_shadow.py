@@ -19,7 +19,7 @@ from collections.abc import Callable
 import numpy as np
 
 from raytac.calibrate.camera_view import with_view
-from raytac.calibrate.direct_fit import DirectFit, FitState
+from raytac.calibrate.direct_fit import HOLD, HOLD_FACTOR, DirectFit, FitState
 from raytac.calibrate.direct_light import ExtraLight, Light, led_light, light_by_place
 from raytac.calibrate.imprint import PixelGeometry, PressedCoat
 from raytac.calibrate.light_parameters import HEIGHT, HEIGHTS, LENGTH, REFERENCE_DISTANCE, SHORTEST
@@ -41,8 +41,8 @@ LEAST = {HEIGHT: HEIGHTS[0], LENGTH: SHORTEST}
 """Least size [mm] that a slope is computed at."""
 ROUNDS, SOLVED = 16, 3
 """Most times that shadows are computed again, and solver steps with each."""
-HOLD, STIFFER, SOFTER = 1000.0, 8.0, 4.0
-"""First stiffness [levels²/σ²] of LEDs to the best state, and its factors."""
+SOFTER = 4.0
+"""Factor by which a round that makes the cost less lowers the stiffness."""
 ENOUGH = 1e-3
 """Part of the cost below which a gain ends the fit."""
 
@@ -133,7 +133,7 @@ def solve_shadowed(problem: DirectFit, state: FitState, tick: Callable[[FitState
             if slow:
                 break
         else:
-            hold *= STIFFER
+            hold *= HOLD_FACTOR
         _, own, state = best
         state = own.near(state, hold).solve(state, SOLVED)
     assert best is not None

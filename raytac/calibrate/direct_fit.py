@@ -69,6 +69,10 @@ BORDER_SIGMA = 4.0
 """That of a circle which leaves the image, over that of the others: labels are worse there."""
 CIRCLE_PRIOR = 300.0
 """Squared residual [levels²] that a circle's deviation of one sigma is worth."""
+HOLD, HOLD_FACTOR = 1000.0, 8.0
+"""First stiffness [levels²/σ²] of LEDs to the best state, and its factor.
+
+Rounds that make the cost worse raise it by the factor, others lower it (Levenberg and Marquardt's rule, between rounds)."""
 ACTIVE = 6
 """Most times that a step is solved for with more parameters at their bounds."""
 STEP = 1e-5

@@ -17,7 +17,7 @@ import numpy as np
 
 from raytac.calibrate.camera_view import VIEW, tells_view, with_view
 from raytac.calibrate.cast_shadow import shadow_slopes, solve_shadowed
-from raytac.calibrate.direct_fit import REST_FACTOR, SIGMA, DirectFit, FitSettings, FitState
+from raytac.calibrate.direct_fit import HOLD, HOLD_FACTOR, REST_FACTOR, SIGMA, DirectFit, FitSettings, FitState
 from raytac.calibrate.direct_light import ExtraLight, Light
 from raytac.calibrate.imprint import RIGID_PAD, press_surface
 from raytac.calibrate.light_parameters import LightParameters, with_parameters
@@ -41,10 +41,6 @@ START_SPREAD = np.array([1.5, 1.5, 1.0, 0.2, 0.2, 0.5, 0.0, 0.0])
 """Standard deviation of the starts: mm, rad, lobe exponent, mm."""
 FEWEST = 4
 """Fewest presses that a fit takes."""
-HOLD, HOLD_FACTOR = 1000.0, 8.0
-"""First stiffness [levels²/σ²] of LEDs to the best state, and its factor.
-
-Rounds that make the cost worse raise it by the factor, others lower it (Levenberg and Marquardt's rule, between rounds)."""
 ENVS = 16
 """Presses in one call of the ray tracer."""
 _LOG = logging.getLogger("raytac")
