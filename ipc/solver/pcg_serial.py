@@ -76,7 +76,7 @@ def precondition(lines: Lines, inverse: MatArray2d, affine: Elimination, env: wp
     }
     return squares[0] + squares[1] + squares[2];
 """)
-def advance(lines: Lines, env: wp.int32, alpha: wp.float64, w: Vectors, x: VecArray2d) -> wp.float64:
+def update_iterate(lines: Lines, env: wp.int32, alpha: wp.float64, w: Vectors, x: VecArray2d) -> wp.float64:
     """x += α p, r −= α H p; returns r·r."""
     ...
 
@@ -93,7 +93,7 @@ def advance(lines: Lines, env: wp.int32, alpha: wp.float64, w: Vectors, x: VecAr
         direction[i] = z[i] + beta * direction[i];
     }
 """)
-def turn(lines: Lines, env: wp.int32, beta: wp.float64, w: Vectors):
+def next_direction(lines: Lines, env: wp.int32, beta: wp.float64, w: Vectors):
     """p = z + β p."""
     ...
 
@@ -139,11 +139,11 @@ def solve_serially(
             s.negative[env] = 1
             break
         s.iterations[env] = it + 1
-        rr, small = advance(lines, env, rz / curvature, w, x), tolerance * tolerance
+        rr, small = update_iterate(lines, env, rz / curvature, w, x), tolerance * tolerance
         new = precondition(lines, inverse, affine, env, w, w.Ap)
         if not (rr > small * rr0) and not (new > small * rz0):
             break
-        turn(lines, env, new / rz, w)
+        next_direction(lines, env, new / rz, w)
         rz = new
     for k in range(n):
         r[env, lines.node[k]] = head(w.r[env, lines.node[k]])

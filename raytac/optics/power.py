@@ -27,7 +27,7 @@ _ROOT_HALF = 0x3F3504F3
 def power(x: Any, exponent: Any) -> Any:
     """xⁿ of a Dr.Jit Float in [0, 1] for n > 0, to the rounding of float32.
 
-    What is below 2⁻¹²⁶ may be 2⁻¹²⁶. On the CPU it takes a third of the operations of ``dr.power``, which knows every number. On CUDA that
+    What is below 2⁻¹²⁶ may be 2⁻¹²⁶. On the CPU it takes fewer operations than ``dr.power``, which knows every number. On CUDA that
     is two instructions.
     """
     if dr.backend_v(x) != dr.JitBackend.LLVM:
